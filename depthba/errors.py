@@ -1,0 +1,21 @@
+"""The errors that depthba knows: each is one line that names the offender, its value and what was expected."""
+
+
+class DepthbaError(Exception):
+    """A known error. The command line prints its one line on stderr and exits with status 1."""
+
+
+class DatasetError(DepthbaError):
+    """A dataset breaks the format: names the file, the frame, the value and what was expected."""
+
+
+class OptionError(DepthbaError):
+    """An option has a value that makes no sense, alone or for this dataset."""
+
+
+class RunError(DepthbaError):
+    """A run folder is missing, in the way, or not whole."""
+
+
+class MissingPackage(DepthbaError):
+    """An optional package is not installed: names the package and the extra that brings it."""
