@@ -1,0 +1,37 @@
+# `make demo` and `make test` each set everything up first; a second call does nothing twice.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/set-up
+
+.PHONY: help setup demo test lint format bench clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP)  ## system libraries, .venv, pinned packages, depthba itself
+
+$(STAMP): pyproject.toml constraints.txt setup/install.sh
+	@PYTHON="$(PYTHON)" bash setup/install.sh
+	@touch $@
+
+demo: $(STAMP)  ## one scene from end to end: generate, register, evaluate, record
+	@$(BIN)/depthba demo
+
+test: $(STAMP)  ## the fast tests
+	@$(BIN)/pytest
+
+lint: $(STAMP)  ## ruff and mypy
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/mypy
+
+format: $(STAMP)  ## let ruff put the code into its form
+	@$(BIN)/ruff check --fix
+	@$(BIN)/ruff format
+
+bench: $(STAMP)  ## the benchmarks
+	@$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+clean:  ## remove .venv and what tools left; runs in logs/ stay
+	@rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks build dist
+	@find depthba sim rig eval tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,174 @@
+"""The command line: finds a verb by its name, parses its arguments, turns errors into a status.
+
+Nothing heavy is imported before the verb is known, so that ``depthba --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+DONE, KNOWN_ERROR, WRONG_USAGE, NOT_TO_BE_TRUSTED, INTERRUPTED = 0, 1, 2, 3, 130
+"""Exit statuses."""
+
+
+@dataclass(frozen=True)
+class Verb:
+    """Where a verb lives."""
+
+    module: str
+    """Holds ``Arguments``, a frozen dataclass, and ``run(arguments) -> int``."""
+    help: str
+    """One line for the overview."""
+    extra: str = ""
+    """The extra that brings what the verb needs beyond the base packages."""
+    needs: tuple[str, ...] = ()
+    """Import names of the packages of that extra that the verb cannot do without."""
+
+
+VERBS = {
+    "demo": Verb(
+        "depthba.verbs.demo",
+        "Generate, register, evaluate and record one scene, end to end.",
+        extra="sim",
+        needs=("mujoco", "embreex"),
+    ),
+    "generate": Verb(
+        "sim.verbs.generate",
+        "Render a dataset of a simulated scene, with known truth.",
+        extra="sim",
+        needs=("mujoco", "embreex"),
+    ),
+    "register": Verb(
+        "depthba.verbs.register", "Estimate the poses and the depth map of a dataset."
+    ),
+    "evaluate": Verb(
+        "eval.verbs.evaluate", "Measure runs against truth, or against themselves without it."
+    ),
+    "review": Verb(
+        "eval.verbs.review",
+        "Open the recordings of runs in the viewer.",
+        extra="eval",
+        needs=("rerun",),
+    ),
+    "doctor": Verb("depthba.verbs.doctor", "Check this machine, or a dataset."),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status.
+
+    Args:
+        argv: the words after the program's name; None takes those of this process.
+    """
+    try:
+        status = _main(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        print("depthba: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the reader of our output has left: there is nobody to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return KNOWN_ERROR
+    except Exception as error:
+        line = _known(error)
+        if line is None:
+            raise
+        print(f"depthba: error: {' '.join(line.split())}", file=sys.stderr)
+        return KNOWN_ERROR
+
+
+def _main(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_overview(), file=sys.stdout if words else sys.stderr)
+        return DONE if words else WRONG_USAGE
+    name, *rest = words
+    if name == "--version":
+        from depthba import __version__
+
+        print(f"depthba {__version__}")
+        return DONE
+    if name not in VERBS:
+        choices = ", ".join(VERBS)
+        print(f"depthba: no verb {name!r}; choose from: {choices}", file=sys.stderr)
+        return WRONG_USAGE
+    module = _load(name)
+    from depthba.verbs.arguments import parse
+
+    arguments = parse(module.Arguments, rest, prog=f"depthba {name}")
+    run: Callable[[object], int] = module.run
+    return run(arguments)
+
+
+def _overview() -> str:
+    width = max(map(len, VERBS))
+    lines = [
+        "usage: depthba VERB [arguments]",
+        "",
+        "Registers many depth frames of one scene at once: every frame's pose and a depth map.",
+        "",
+        "verbs:",
+    ]
+    for name, verb in VERBS.items():
+        missing = _missing(verb)
+        note = f" (needs {missing}: pip install 'depthba[{verb.extra}]')" if missing else ""
+        lines.append(f"  {name:<{width}}  {verb.help}{note}")
+    lines += [
+        "",
+        "options:",
+        "  -h, --help     this page; `depthba VERB --help` for the arguments of a verb",
+        "  --version      the version of depthba",
+        "  --config FILE  (after the verb) defaults from a YAML file; the command line wins",
+        "",
+        "exit status: 0 done, 1 error, 2 wrong usage, 3 finished but not to be trusted",
+    ]
+    return "\n".join(lines)
+
+
+def _missing(verb: Verb) -> str:
+    """Return the packages that the verb needs and that are not installed, without importing any."""
+    return ", ".join(name for name in verb.needs if importlib.util.find_spec(name) is None)
+
+
+def _load(name: str) -> ModuleType:
+    from depthba.errors import MissingPackage
+
+    verb = VERBS[name]
+    missing = _missing(verb)
+    if missing:
+        raise MissingPackage(_install_line(name, missing, verb.extra))
+    try:
+        return importlib.import_module(verb.module)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("depthba", "sim", "rig", "eval", ""):
+            raise
+        raise MissingPackage(_install_line(name, package, verb.extra)) from error
+
+
+def _install_line(verb: str, packages: str, extra: str) -> str:
+    what = f"depthba[{extra}]" if extra else "depthba"
+    return f"{verb} needs {packages}, which is not installed: pip install '{what}'"
+
+
+def _known(error: Exception) -> str | None:
+    """Return the line for an error that is no fault of the program, else None."""
+    from depthba.errors import DepthbaError
+
+    if isinstance(error, DepthbaError):
+        return str(error)
+    if isinstance(error, OSError) and error.errno is not None:
+        # a missing file, no permission, a full disk
+        reason = error.strerror or str(error)
+        return reason if error.filename is None else f"{error.filename}: {reason}"
+    return None

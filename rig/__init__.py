@@ -1,0 +1,1 @@
+"""The real capture rig: arm, axes, cameras and capture sessions. Nothing of it is written yet."""
