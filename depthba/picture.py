@@ -1,0 +1,316 @@
+"""Pictures of a run: the map as shaded relief, and the spread between frames, before and after."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import durable
+from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, transform
+from depthba.dataset import Dataset
+from depthba.depth_map import DepthMap
+from depthba.options import Options
+from depthba.result import Result
+from depthba.spread import CellSpread, cell_spread
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+CELL_SPACINGS = 4.0
+"""Cells of the spread are this many point spacings wide: enough points for a mean, small enough for slopes."""
+EMPTY = "#e9e9ec"
+HEIGHTS, SPREADS = "gist_earth", "inferno_r"
+BEFORE, AFTER = "Before: start poses", "After: depthba"
+
+
+@dataclass(frozen=True)
+class Spreads:
+    """Spread between the frames at the start poses and at the estimate."""
+
+    before: CellSpread
+    after: CellSpread
+
+
+def spreads(
+    result: Result, dataset: Dataset, clouds: Sequence[FrameCloud], roi: Sequence[float] | None
+) -> Spreads:
+    """Compare the frames cell by cell, in the map frame, at the start poses and at the estimated ones."""
+    cell = CELL_SPACINGS * point_spacing(dataset, [c.points for c in clouds])
+    T_map_world = result.depth_map.T_map_world
+
+    def at(T_world_camera: Floats) -> CellSpread:
+        points = []
+        for cloud, T in zip(clouds, T_world_camera, strict=True):
+            p = transform(T_map_world @ T, cloud.points)
+            points.append(p[inside(p, roi)])
+        return cell_spread(points, cell)
+
+    return Spreads(at(result.T_world_camera_start), at(result.T_world_camera))
+
+
+def map_picture(
+    result: Result,
+    dataset: Dataset,
+    path: str | os.PathLike[str],
+    *,
+    options: Options | None = None,
+    clouds: Sequence[FrameCloud] | None = None,
+) -> None:
+    """Draw map.png: above the map before and after, below the spread between frames before and after.
+
+    Args:
+        result: what to draw.
+        dataset: its frames.
+        path: where to write the PNG.
+        options: the options of the run, for its region of interest.
+        clouds: the points of all frames, where the caller has them already.
+
+    """
+    clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
+    both = spreads(result, dataset, clouds, options.roi if options else None)
+    box = _extent(result.depth_map)
+    width, height = box[1] - box[0], box[3] - box[2]
+    panel = np.clip(6.2 * height / width, 2.2, 7.5)
+    figure = _figure(14.5, 2 * panel + 2.1)
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    for ax, depth_map, title in zip(
+        axes[0], (result.depth_map_start, result.depth_map), (BEFORE, AFTER), strict=True
+    ):
+        relief = _draw_relief(ax, depth_map, _height_range(result))
+        ax.set_title(f"Map. {title}", loc="left", fontweight="bold")
+    _bar(figure, relief, axes[0], "height (m)")
+    top = _spread_top(both)
+    for ax, spread, title in zip(axes[1], (both.before, both.after), (BEFORE, AFTER), strict=True):
+        image = _draw_spread(ax, spread, top)
+        ax.set_title(f"Disagreement of frames. {title}", loc="left", fontweight="bold")
+        ax.set_title(f"median {millimetres(spread.quantile(0.5))}", loc="right")
+    _bar(figure, image, axes[1], "spread of the frames' heights (mm)", extend="max")
+    for ax in axes.flat:
+        _frame(ax, box)
+    for ax in axes[1]:
+        ax.set_xlabel("x (m)")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y (m)")
+    figure.suptitle(
+        f"{dataset.name}: {len(clouds)} frames, map spacing "
+        f"{millimetres(result.depth_map.spacing)}, {result.status.replace('_', ' ')}",
+        fontsize=14,
+    )
+    _save(figure, path, dpi=110)
+
+
+def before_after(
+    result: Result,
+    dataset: Dataset,
+    path: str | os.PathLike[str],
+    *,
+    options: Options | None = None,
+    clouds: Sequence[FrameCloud] | None = None,
+) -> None:
+    """Draw a compact picture for a page: the disagreement of the frames before and after, and the map.
+
+    Args:
+        result: what to draw.
+        dataset: its frames.
+        path: where to write the PNG.
+        options: the options of the run, for its region of interest.
+        clouds: the points of all frames, where the caller has them already.
+
+    """
+    clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
+    both = spreads(result, dataset, clouds, options.roi if options else None)
+    box = _extent(result.depth_map)
+    panel = np.clip(4.6 * (box[3] - box[2]) / (box[1] - box[0]), 1.8, 5.5)
+    figure = _figure(15.0, panel + 1.1)
+    axes = figure.subplots(1, 3, sharex=True, sharey=True)
+    top = _spread_top(both)
+    for ax, spread, title in zip(
+        axes[:2], (both.before, both.after), ("Start poses", "After depthba"), strict=True
+    ):
+        image = _draw_spread(ax, spread, top)
+        median = millimetres(spread.quantile(0.5))
+        ax.set_title(f"{title}: frames disagree by {median}", fontweight="bold")
+    _bar(figure, image, axes[:2], "spread between frames (mm)", extend="max")
+    relief = _draw_relief(axes[2], result.depth_map, _height_range(result))
+    axes[2].set_title("The map", fontweight="bold")
+    _bar(figure, relief, axes[2:], "height (m)")
+    for ax in axes:
+        _frame(ax, box)
+        ax.set_xticks([])
+        ax.set_yticks([])
+        _scale_bar(ax, box)
+    _save(figure, path, dpi=100)
+
+
+def height_colours(
+    heights: Floats, low: float | None = None, high: float | None = None
+) -> NDArray[np.uint8]:
+    """Return (..., 3) colours for ``heights``, from ``low`` to ``high`` m; by default 1 % to 99 % of them."""
+    from matplotlib import colormaps
+
+    known = heights[np.isfinite(heights)]
+    if not len(known):
+        return np.full((*heights.shape, 3), 230, np.uint8)
+    low = float(np.quantile(known, 0.01)) if low is None else low
+    high = float(np.quantile(known, 0.99)) if high is None else high
+    # the palest end of the colour map reads as "nothing there"
+    level = 0.92 * np.clip((heights - low) / max(high - low, 1e-12), 0.0, 1.0)
+    rgba = colormaps[HEIGHTS](np.nan_to_num(level))
+    return np.rint(255.0 * rgba[..., :3]).astype(np.uint8)
+
+
+def shade(heights: Floats, spacing: float) -> Floats:
+    """Return (ny, nx) brightness, 1 on level ground, of a surface lit from the upper left; NaN stays NaN.
+
+    The slopes are stretched until half of them are steep enough to be seen.
+    """
+    known = np.isfinite(heights)
+    if not known.any() or min(heights.shape) < 2:
+        return np.where(known, 1.0, np.nan)
+    from scipy.ndimage import distance_transform_edt
+
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    filled = heights[tuple(nearest)]  # holes must not darken their rims
+    slope_y, slope_x = np.gradient(filled, spacing)
+    steep = float(np.median(np.hypot(slope_x, slope_y)[known]))
+    stretch = np.clip(0.35 / max(steep, 1e-9), 0.5, 8.0)
+    slope_x, slope_y = stretch * slope_x, stretch * slope_y
+    light = np.array([-1.0, 1.0, 1.6]) / np.linalg.norm([-1.0, 1.0, 1.6])
+    lit = (-slope_x * light[0] - slope_y * light[1] + light[2]) / np.sqrt(
+        1 + slope_x**2 + slope_y**2
+    )
+    return np.where(known, np.clip(lit / light[2], 0.25, 1.45), np.nan)
+
+
+def relief_image(depth_map: DepthMap, low: float, high: float) -> NDArray[np.uint8]:
+    """Return the map as shaded relief, (ny, nx, 4) red green blue alpha, transparent where unseen."""
+    colours = height_colours(depth_map.heights, low, high).astype(float)
+    light = np.nan_to_num(shade(depth_map.heights, depth_map.spacing))[..., None]
+    alpha = 255.0 * np.isfinite(depth_map.heights)[..., None]
+    return np.rint(np.concatenate([np.clip(colours * light, 0, 255), alpha], -1)).astype(np.uint8)
+
+
+def millimetres(metres: float) -> str:
+    """Return a length for people, three digits: ``0.0152 mm``, ``17.4 mm``."""
+    if not np.isfinite(metres):
+        return "unknown"
+    mm = 1e3 * metres
+    digits = 2 - int(np.floor(np.log10(abs(mm)))) if mm else 2
+    return f"{mm:.{min(max(digits, 0), 5)}f} mm"
+
+
+def _figure(width: float, height: float) -> Figure:
+    """Make a figure that needs no screen and touches none of pyplot's global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, path: str | os.PathLike[str], dpi: int) -> None:
+    """Write the figure as PNG, whole or not at all."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=dpi, metadata={"Software": None})
+    durable.write_bytes(path, out.getvalue())
+
+
+def _extent(depth_map: DepthMap) -> tuple[float, float, float, float]:
+    """Return xmin xmax ymin ymax of what was seen, metres."""
+    ys, xs = np.nonzero(np.isfinite(depth_map.heights))
+    if not len(ys):
+        ny, nx = depth_map.shape
+        ys, xs = np.array([0, ny - 1]), np.array([0, nx - 1])
+    x, y, s = *depth_map.origin, depth_map.spacing
+    return (
+        x + s * (xs.min() - 0.5),
+        x + s * (xs.max() + 0.5),
+        y + s * (ys.min() - 0.5),
+        y + s * (ys.max() + 0.5),
+    )
+
+
+def _height_range(result: Result) -> tuple[float, float]:
+    """Return the heights that the colours span in both maps, so that equal colours are equal heights."""
+    known = result.depth_map.heights[np.isfinite(result.depth_map.heights)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.quantile(known, [0.01, 0.99])
+    return float(low), float(high)
+
+
+def _spread_top(both: Spreads) -> float:
+    """Return the end of the spread's colours, mm: most of what the start shows."""
+    top = 1e3 * np.nanmax([both.before.quantile(0.9), both.after.quantile(0.5), 1e-6])
+    return float(top)
+
+
+def _draw_relief(ax: Axes, depth_map: DepthMap, span: tuple[float, float]) -> Any:
+    """Draw shaded relief; return something that a colour bar can be made of."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    ny, nx = depth_map.shape
+    x, y, s = *depth_map.origin, depth_map.spacing
+    extent = (x - 0.5 * s, x + (nx - 0.5) * s, y - 0.5 * s, y + (ny - 0.5) * s)
+    ax.imshow(
+        relief_image(depth_map, *span), extent=extent, origin="lower", interpolation="nearest"
+    )
+    ramp = height_colours(np.linspace(0.0, 1.0, 256), 0.0, 1.0) / 255.0
+    return ScalarMappable(Normalize(*span), ListedColormap(ramp.tolist()))
+
+
+def _draw_spread(ax: Axes, spread: CellSpread, top: float) -> Any:
+    """Draw the spread in mm."""
+    ny, nx = spread.shape
+    x, y, s = *spread.origin, spread.cell
+    return ax.imshow(
+        1e3 * spread.image(),
+        extent=(x, x + nx * s, y, y + ny * s),
+        origin="lower",
+        cmap=SPREADS,
+        vmin=0.0,
+        vmax=top,
+        interpolation="nearest",
+    )
+
+
+def _bar(figure: Figure, mappable: Any, axes: Any, label: str, extend: str = "neither") -> None:
+    figure.colorbar(mappable, ax=list(axes), label=label, extend=extend, shrink=0.9, pad=0.01)
+
+
+def _frame(ax: Axes, box: tuple[float, float, float, float]) -> None:
+    """Fix what all panels share: the same part of the map, true proportions, a quiet ground."""
+    ax.set_facecolor(EMPTY)
+    ax.set_aspect("equal")
+    ax.set_xlim(box[0], box[1])
+    ax.set_ylim(box[2], box[3])
+
+
+def _scale_bar(ax: Axes, box: tuple[float, float, float, float]) -> None:
+    """Draw a bar of a round length in the lower left corner."""
+    width, height = box[1] - box[0], box[3] - box[2]
+    exponent = np.floor(np.log10(0.3 * width))
+    length = max(m * 10**exponent for m in (1, 2, 5) if m * 10**exponent <= 0.3 * width)
+    x, y = box[0] + 0.04 * width, box[2] + 0.05 * height
+    ax.plot([x, x + length], [y, y], color="white", lw=6, solid_capstyle="butt")
+    ax.plot([x, x + length], [y, y], color="black", lw=3, solid_capstyle="butt")
+    text = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    ax.text(
+        x + 0.5 * length,
+        y + 0.02 * height,
+        text,
+        ha="center",
+        va="bottom",
+        bbox={"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5},
+    )
