@@ -24,6 +24,8 @@ lint: $(STAMP)  ## ruff and mypy
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
+	@! grep -rnE '^ *import eval\.[a-z_.]+ *$$' --include='*.py' depthba sim rig eval tests \
+		|| { echo 'that hides the builtin eval: write "from eval import …"'; exit 1; }
 
 format: $(STAMP)  ## let ruff put the code into its form
 	@$(BIN)/ruff check --fix

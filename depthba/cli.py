@@ -13,11 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from depthba.verbs import DONE, INTERRUPTED, KNOWN_ERROR, WRONG_USAGE
+
 if TYPE_CHECKING:
     from types import ModuleType
-
-DONE, KNOWN_ERROR, WRONG_USAGE, NOT_TO_BE_TRUSTED, INTERRUPTED = 0, 1, 2, 3, 130
-"""Exit statuses."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("depthba: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # the reader of our output has left: there is nobody to tell
+        # the reader of our output has left: nobody is there to be told
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return KNOWN_ERROR
     except Exception as error:

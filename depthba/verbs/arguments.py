@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import inspect
 import io
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -36,21 +37,22 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
         OSError: that file cannot be read.
     """
     config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
-    wrapped = dataclasses.make_dataclass(
-        kind.__name__, [("arguments", kind), ("config", config_type, None)]
+    with_config: Any = dataclasses.make_dataclass(
+        kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
     )
     path = _config_path(words)
-    default = None if path is None else wrapped(_with_defaults(kind, _read(path, kind)), path)
+    default = None if path is None else _with_defaults(with_config, _read(path, kind))
     parsed: Any = tyro.cli(
-        wrapped,
+        with_config,
         prog=prog,
         args=list(words),
-        description=kind.__doc__,
+        description=inspect.cleandoc(kind.__doc__ or ""),
         default=default,
         config=_STYLE,
     )
-    arguments: Arguments = parsed.arguments
-    return arguments
+    values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(with_config)}
+    del values["config"]
+    return kind(**values)
 
 
 def known_keys(kind: type[Any]) -> dict[str, Any]:
@@ -66,9 +68,9 @@ def known_keys(kind: type[Any]) -> dict[str, Any]:
 
 def _config_path(words: Sequence[str]) -> str | None:
     path = None
-    for word, following in zip(words, [*words[1:], None], strict=True):
-        if word == "--config":
-            path = following
+    for index, word in enumerate(words):
+        if word == "--config" and index + 1 < len(words):
+            path = words[index + 1]
         elif word.startswith("--config="):
             path = word.partition("=")[2]
     return path
@@ -92,7 +94,8 @@ def _read(path: str, kind: type[Any]) -> dict[str, Any]:
     for key, value in content.items():
         name = str(key).replace("-", "_")
         if name not in keys:
-            raise OptionError(f"{path}: unknown key {key!r}; choose from: {', '.join(sorted(keys))}")
+            choices = ", ".join(sorted(keys))
+            raise OptionError(f"{path}: unknown key {key!r}; choose from: {choices}")
         values[name] = _value(path, name, value, keys[name])
     return values
 

@@ -1,0 +1,218 @@
+"""The verb ``register``: a dataset in, a run folder out."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from depthba.options import Options
+from depthba.result import Iteration, Result
+from depthba.verbs import DONE, NOT_TO_BE_TRUSTED
+from depthba.verbs.output import angle, length, note, print_json
+
+if TYPE_CHECKING:
+    from depthba.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Estimate every frame's pose and the depth map of a dataset.
+
+    Exit status: 0 converged; 3 finished, but not to be trusted.
+    """
+
+    dataset: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+    """Folder of the dataset."""
+    out: Path | None = None
+    """Folder for the run, new or empty. None: logs/<name>-<yyyymmdd-hhmmss>."""
+    overwrite: bool = False
+    """Write into the folder even where it holds an earlier run."""
+    json: bool = False
+    """Print one JSON object on stdout in place of text."""
+    options: Options = field(default_factory=Options)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A registration and where it was written."""
+
+    result: Result
+    run: Path
+    """The run folder."""
+    recording: Path | None
+    """None: no recording was made."""
+    seconds: float
+    """Of the registration alone, without reading the dataset's list and writing the run."""
+
+
+def run(arguments: Arguments) -> int:
+    """Register a dataset, write the run folder, say how it went; return the exit status."""
+    from depthba.dataset import Dataset
+
+    dataset = Dataset.open(arguments.dataset)
+    for warning in dataset.warnings:
+        note(f"warning: {warning}")
+    outcome = register_into(dataset, arguments.options, arguments.out, arguments.overwrite)
+    if arguments.json:
+        print_json(summary(outcome))
+    else:
+        print("\n".join(report(dataset.name, outcome)))
+    return DONE if outcome.result.trusted else NOT_TO_BE_TRUSTED
+
+
+def register_into(
+    dataset: Dataset, options: Options, out: Path | None = None, overwrite: bool = False
+) -> Outcome:
+    """Register a dataset into a run folder, with progress on stderr and a recording.
+
+    Args:
+        dataset: what to register.
+        options: how.
+        out: the run folder; None takes a new one in logs/.
+        overwrite: whether the folder may hold an earlier run.
+
+    Raises:
+        DepthbaError: the dataset, the options or the folder do not do. A folder that was
+            made here is then removed again, as it is when the user interrupts.
+    """
+    import depthba
+    from depthba.run_folder import RunFolder, default_path
+    from depthba.verbs.progress import RegistrationProgress
+
+    path = default_path(dataset.name) if out is None else out
+    with _claimed(path, overwrite):
+        folder = RunFolder.create(path, overwrite=overwrite)
+        recorder = _recorder(path / "run.rrd", dataset, options)
+        with RegistrationProgress(dataset.name) as progress:
+            begin = time.perf_counter()
+            result = depthba.register(dataset, options, callback=_both(progress, recorder))
+            seconds = time.perf_counter() - begin
+        folder.write(result, options, dataset)
+        if recorder is not None:
+            recorder.finish(result)
+    return Outcome(result, path, None if recorder is None else path / "run.rrd", seconds)
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """Return what ``--json`` prints: metres, radians, seconds."""
+    result = outcome.result
+    return {
+        "status": result.status,
+        "trusted": result.trusted,
+        "reason": result.reason,
+        "frames": len(result.frames),
+        "iterations": len(result.history),
+        "seconds": outcome.seconds,
+        "largest_move_m": max((frame.move_t for frame in result.frames), default=0.0),
+        "largest_move_rad": max((frame.move_r for frame in result.frames), default=0.0),
+        "sigma_m": result.sigma,
+        "spacing_m": result.depth_map.spacing,
+        "weak": [
+            {
+                "frame": weak.frame,
+                "name": weak.name,
+                "sigma_m": weak.sigma,
+                "prior_sigma_m": weak.prior_sigma,
+            }
+            for weak in result.weak
+        ],
+        "held": [
+            {"frame": frame.frame, "why": frame.held} for frame in result.frames if frame.held
+        ],
+        "run": str(outcome.run),
+        "recording": None if outcome.recording is None else str(outcome.recording),
+    }
+
+
+def report(name: str, outcome: Outcome, most: int = 6) -> list[str]:
+    """Return the lines for people; of weak directions and held frames the first ``most``."""
+    result = outcome.result
+    ny, nx = result.depth_map.shape
+    lines = [
+        f"{name}: {result.status.replace('_', ' ')}. {result.reason}",
+        f"  frames        {len(result.frames)}, in {len(result.history)} iterations "
+        f"and {outcome.seconds:.1f} s",
+        f"  map           {nx} x {ny} nodes, {length(result.depth_map.spacing)} apart",
+    ]
+    if result.frames:
+        far = max(result.frames, key=lambda frame: frame.move_t)
+        turned = max(result.frames, key=lambda frame: frame.move_r)
+        lines.append(
+            f"  largest move  {length(far.move_t)} (frame {far.frame}), "
+            f"{angle(turned.move_r)} (frame {turned.frame})"
+        )
+    lines.append(f"  sigma         {length(result.sigma)} of the residuals")
+    lines += _first(
+        "weak",
+        [
+            f"frame {weak.frame} along {weak.name}: the data leave {length(weak.sigma)}, "
+            f"its measured pose {length(weak.prior_sigma)}"
+            for weak in result.weak
+        ],
+        most,
+    )
+    held = [f"frame {frame.frame}: {frame.held}" for frame in result.frames if frame.held]
+    lines += _first("held", held, most)
+    lines.append(f"  run           {outcome.run}")
+    lines.append(f"  picture       {outcome.run / 'map.png'}")
+    if outcome.recording is not None:
+        lines.append(f"  recording     {outcome.recording}")
+    return lines
+
+
+def _first(title: str, items: list[str], most: int) -> list[str]:
+    lines = [f"  {title if i == 0 else '':<13} {item}" for i, item in enumerate(items[:most])]
+    if len(items) > most:
+        lines.append(f"  {'':<13} and {len(items) - most} more, see result.json")
+    return lines
+
+
+@contextmanager
+def _claimed(path: Path, overwrite: bool) -> Iterator[None]:
+    """On any failure, interrupts too, remove what was begun, so that nothing half-written stays."""
+    existed = path.exists()
+    taken = path.is_dir() and any(path.iterdir())
+    try:
+        yield
+    except BaseException:
+        if taken and overwrite:
+            # the earlier run may be part replaced: without result.json it counts for nothing
+            (path / "run.rrd").unlink(missing_ok=True)
+            (path / "result.json").unlink(missing_ok=True)
+        elif not taken and path.is_dir():
+            for item in path.iterdir():
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
+            if not existed:
+                path.rmdir()
+        raise
+
+
+def _recorder(path: Path, dataset: Dataset, options: Options) -> Any:
+    """Return a recorder from the package above, which may be missing: then None, and a note."""
+    try:
+        recording = importlib.import_module("eval.recording")
+        return recording.Recorder(path, dataset, options)
+    except ImportError as error:
+        note(f"note: no recording is made ({error}): pip install 'depthba[eval]'")
+        return None
+
+
+def _both(
+    progress: Callable[[Iteration], None], recorder: Callable[[Iteration], None] | None
+) -> Callable[[Iteration], None]:
+    if recorder is None:
+        return progress
+
+    def callback(iteration: Iteration) -> None:
+        progress(iteration)
+        recorder(iteration)
+
+    return callback
