@@ -93,7 +93,9 @@ class RangeNoise:
 
     def sigma(self, z: ArrayLike) -> Array:
         """Return the standard deviation in metres at depths ``z`` in metres, same shape."""
-        return np.asarray(self.sigma_m * (np.asarray(z, dtype=np.float64) / self.at_m) ** self.power)
+        return np.asarray(
+            self.sigma_m * (np.asarray(z, dtype=np.float64) / self.at_m) ** self.power
+        )
 
 
 def _distort(xy: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
