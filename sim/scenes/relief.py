@@ -1,0 +1,138 @@
+"""A height raster on which a scene is piled up, and how bodies come to rest on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import ConvexHull, QhullError
+
+Array = NDArray[np.float64]
+
+
+class Hull(NamedTuple):
+    """A convex body: vertices (n, 3) m, outward faces (m, 3), and planes (k, 4) with n.x + d <= 0 inside."""
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    planes: Array
+
+
+def hull_of(points: Array) -> Hull:
+    """The convex hull of points (n, 3), faces turned outwards and unused points dropped."""
+    hull = ConvexHull(points)
+    used = np.unique(hull.simplices)
+    number = np.full(len(points), -1)
+    number[used] = np.arange(len(used))
+    faces = number[hull.simplices]
+    vertices = points[used]
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    return Hull(vertices, faces, np.unique(hull.equations.round(9), axis=0))
+
+
+def box_planes(size: tuple[float, float, float]) -> Array:
+    """The six planes (6, 4) of a box with half lengths `size` m."""
+    normals = np.vstack([np.eye(3), -np.eye(3)])
+    return np.column_stack([normals, -np.tile(size, 2)])
+
+
+def turned(planes: Array, rotation: Array) -> Array:
+    """Planes (k, 4) of a body after a rotation (3, 3) about its origin."""
+    return np.column_stack([planes[:, :3] @ rotation.T, planes[:, 3]])
+
+
+@dataclass
+class Relief:
+    """Heights z[row, column] m of the highest surface, node [0, 0] at `origin` (x, y) m."""
+
+    z: Array
+    origin: tuple[float, float]
+    spacing: float
+
+    def at(self, x: Array | float, y: Array | float) -> Array:
+        """Heights by bilinear interpolation; the border value outside."""
+        rows = (np.asarray(y, float) - self.origin[1]) / self.spacing
+        columns = (np.asarray(x, float) - self.origin[0]) / self.spacing
+        shape = np.broadcast_shapes(rows.shape, columns.shape)
+        where = np.array([np.broadcast_to(k, shape).ravel() for k in (rows, columns)])
+        return np.reshape(map_coordinates(self.z, where, order=1, mode="nearest"), shape)
+
+    def slope(self, x: float, y: float, reach: float) -> Array:
+        """The gradient (2,) of the surface, taken over a distance `reach` m to either side."""
+        h = self.at(np.array([x + reach, x - reach, x, x]), np.array([y, y, y + reach, y - reach]))
+        return np.array([h[0] - h[1], h[2] - h[3]]) / (2.0 * reach)
+
+    def window(self, x: float, y: float, radius: float) -> tuple[tuple[slice, slice], Array, Array]:
+        """The nodes within a square around (x, y): slices into z, and their offsets dx, dy."""
+        rows, columns = self.z.shape
+        c0 = max(int(np.floor((x - radius - self.origin[0]) / self.spacing)), 0)
+        c1 = min(int(np.ceil((x + radius - self.origin[0]) / self.spacing)) + 1, columns)
+        r0 = max(int(np.floor((y - radius - self.origin[1]) / self.spacing)), 0)
+        r1 = min(int(np.ceil((y + radius - self.origin[1]) / self.spacing)) + 1, rows)
+        dx = self.origin[0] + self.spacing * np.arange(c0, max(c0, c1)) - x
+        dy = self.origin[1] + self.spacing * np.arange(r0, max(r0, r1)) - y
+        return (slice(r0, r1), slice(c0, c1)), dx[None, :], dy[:, None]
+
+    def raise_to(self, planes: Array, x: float, y: float, z: float, radius: float) -> None:
+        """Lift the surface to the top of a convex body standing at (x, y, z)."""
+        where, dx, dy = self.window(x, y, radius)
+        bottom, top = _span(planes, dx, dy)
+        self.z[where] = np.where(top >= bottom, np.maximum(self.z[where], top + z), self.z[where])
+
+    def bed(self, planes: Array, x: float, y: float, radius: float, sink: float) -> float:
+        """The height at which a convex body lies when a share `sink` of its underside has sunk in."""
+        where, dx, dy = self.window(x, y, radius)
+        bottom, top = _span(planes, dx, dy)
+        inside = top >= bottom
+        if not inside.any():
+            return float(self.at(x, y))
+        return float(np.quantile((self.z[where] - bottom)[inside], 1.0 - sink))
+
+
+def _span(planes: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
+    """The lowest and the highest z of a convex body over offsets dx (1, n), dy (m, 1)."""
+    nx, ny, nz, d = (planes[:, k][:, None, None] for k in range(4))
+    rest = -(d + nx * dx[None] + ny * dy[None])
+    flat = np.abs(planes[:, 2]) < 1e-6
+    up, down = planes[:, 2] >= 1e-6, planes[:, 2] <= -1e-6
+    top = (rest[up] / nz[up]).min(axis=0)
+    bottom = (rest[down] / nz[down]).max(axis=0)
+    if flat.any():
+        top = np.where((rest[flat] < 0.0).any(axis=0), -np.inf, top)
+    return bottom, top
+
+
+def rest_on_three(
+    relief: Relief, x: float, y: float, yaw: float, half: tuple[float, float]
+) -> tuple[Array, Array]:
+    """How a flat-bottomed body of half lengths `half` m comes to rest: it stands on three points.
+
+    Those are the corners of the upper convex hull's facet above which the centre of mass hangs, so
+    the pose is in static equilibrium. Returns the rotation (3, 3) and the bottom's centre (3,).
+    """
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    reach = [np.arange(-h, h + 1e-9, max(relief.spacing, h / 60.0)) for h in half]
+    u, v = (a.ravel() for a in np.meshgrid(*reach))
+    px, py = x + cos * u - sin * v, y + sin * u + cos * v
+    points = np.column_stack([u, v, relief.at(px, py)])
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # a flat floor: any three points carry it
+        normal, height = np.array([0.0, 0.0, 1.0]), float(points[:, 2].max())
+    else:
+        over = hull.equations[hull.equations[:, 2] > 1e-6]
+        heights = -over[:, 3] / over[:, 2]
+        # Above the centre the hull's top is its lowest upper plane.
+        facet = int(np.argmin(heights))
+        normal, height = over[facet, :3], float(heights[facet])
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    up = turn @ normal
+    side = np.cross(up, turn[:, 0])
+    side /= np.linalg.norm(side)
+    rotation = np.column_stack([np.cross(side, up), side, up])
+    return rotation, np.array([x, y, height])

@@ -1,0 +1,177 @@
+"""Triangles of a compiled MuJoCo model, as the ray caster needs them.
+
+Meshes, boxes and height fields are exact. Round shapes are inscribed with 256 segments, which keeps
+the 99th percentile of the depth error at 0.024 mm (512: 0.006 mm).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine import mujoco
+from sim.errors import SimulationError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mesh = tuple[Array, Indices]
+
+SEGMENTS = 256
+
+PLANE_REACH = 50.0
+"""Half length at which an infinite plane is cut off, m."""
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """A triangle soup in world coordinates that remembers the geom of each triangle."""
+
+    vertices: Array
+    """(n, 3), m."""
+    faces: Indices
+    """(m, 3), counter-clockwise seen from outside."""
+    geom: Indices
+    """(m,) geom id of each face."""
+
+
+def triangles_of(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    groups: tuple[int, ...] = (0, 1, 2),
+    segments: int = SEGMENTS,
+) -> Triangles:
+    """The triangles of every visible geom (alpha above 0, group in `groups`) at the pose in `data`.
+
+    `data` must hold the forward kinematics. SimulationError names a geom of a kind without triangles.
+    """
+    local: dict[tuple[object, ...], Mesh] = {}
+    vertices, faces, owner = [], [], []
+    count = 0
+    for geom in range(model.ngeom):
+        if model.geom_group[geom] not in groups or _alpha(model, geom) == 0.0:
+            continue
+        key = (int(model.geom_type[geom]), int(model.geom_dataid[geom]), *model.geom_size[geom])
+        if key not in local:
+            local[key] = _shape(model, geom, segments)
+        v, f = local[key]
+        vertices.append(v @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+        faces.append(f + count)
+        owner.append(np.full(len(f), geom))
+        count += len(v)
+    if not vertices:
+        raise SimulationError("the scene has no visible geom")
+    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(owner))
+
+
+def _alpha(model: mujoco.MjModel, geom: int) -> float:
+    material = int(model.geom_matid[geom])
+    return float(model.geom_rgba[geom, 3] if material < 0 else model.mat_rgba[material, 3])
+
+
+def _shape(model: mujoco.MjModel, geom: int, segments: int) -> Mesh:
+    kinds = mujoco.mjtGeom
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == kinds.mjGEOM_MESH:
+        return _mesh(model, int(model.geom_dataid[geom]))
+    if kind == kinds.mjGEOM_HFIELD:
+        return _height_field(model, int(model.geom_dataid[geom]))
+    makers: dict[int, Callable[[], Mesh]] = {
+        int(kinds.mjGEOM_PLANE): lambda: _plane(size),
+        int(kinds.mjGEOM_BOX): lambda: _box(size),
+        int(kinds.mjGEOM_SPHERE): lambda: _ellipsoid(size[[0, 0, 0]], 0.0, segments),
+        int(kinds.mjGEOM_ELLIPSOID): lambda: _ellipsoid(size, 0.0, segments),
+        int(kinds.mjGEOM_CAPSULE): lambda: _ellipsoid(size[[0, 0, 0]], size[1], segments),
+        int(kinds.mjGEOM_CYLINDER): lambda: _cylinder(size, segments),
+    }
+    if int(kind) not in makers:
+        name = model.geom(geom).name or f"number {geom}"
+        raise SimulationError(
+            f"geom {name} is of kind {kinds(kind).name}, which cannot be rendered"
+        )
+    return makers[int(kind)]()
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> Mesh:
+    v0, nv = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    f0, nf = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    return model.mesh_vert[v0 : v0 + nv].astype(float), model.mesh_face[f0 : f0 + nf].astype(
+        np.int64
+    )
+
+
+def _plane(size: Array) -> Mesh:
+    x, y = (s if s > 0.0 else PLANE_REACH for s in size[:2])
+    corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _box(size: Array) -> Mesh:
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    quads = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
+    return signs * size, _split(np.array(quads))
+
+
+def _split(quads: Indices) -> Indices:
+    """Quads (n, 4), cut along their first diagonal."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def _rings(rings: Array, bottom: Array, top: Array) -> Mesh:
+    """A closed surface from rings (k, n, 3), listed upwards, and its two poles."""
+    k, n = rings.shape[:2]
+    index = np.arange(k * n).reshape(k, n)
+    after = np.roll(index, -1, axis=1)
+    quads = np.stack([index[:-1], after[:-1], after[1:], index[1:]], axis=-1).reshape(-1, 4)
+    south = np.stack([np.full(n, k * n), after[0], index[0]], axis=-1)
+    north = np.stack([np.full(n, k * n + 1), index[-1], after[-1]], axis=-1)
+    vertices = np.concatenate([rings.reshape(-1, 3), bottom[None], top[None]])
+    return vertices, np.concatenate([_split(quads), south, north])
+
+
+def _circle(segments: int) -> Array:
+    angle = 2.0 * np.pi * np.arange(segments) / segments
+    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(segments)])
+
+
+def _cylinder(size: Array, segments: int) -> Mesh:
+    up = np.array([0.0, 0.0, size[1]])
+    ring = _circle(segments) * size[0]
+    return _rings(np.stack([ring - up, ring + up]), -up, up)
+
+
+def _ellipsoid(axes: Array, stretch: float, segments: int) -> Mesh:
+    """An ellipsoid; with `stretch` its halves are that far apart along z: a capsule."""
+    half = segments // 4
+    latitude = 0.5 * np.pi * np.arange(-half + 1, half) / half
+    if stretch:  # the equator twice
+        latitude = np.concatenate([latitude[:half], latitude[half - 1 :]])
+    lift = np.where(np.arange(len(latitude)) < half, -stretch, stretch)[:, None, None]
+    up = np.array([0.0, 0.0, 1.0])
+    rings = (
+        np.cos(latitude)[:, None, None] * _circle(segments) + np.sin(latitude)[:, None, None] * up
+    )
+    rings = rings * axes + lift * up
+    pole = up * (axes[2] + stretch)
+    return _rings(rings, -pole, pole)
+
+
+def _height_field(model: mujoco.MjModel, field: int) -> Mesh:
+    """The top, split along (r, c)-(r+1, c+1) as MuJoCo does, with its skirt and base."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    start = model.hfield_adr[field]
+    sx, sy, height, base = model.hfield_size[field]
+    z = model.hfield_data[start : start + rows * columns].astype(float) * height
+    y, x = np.meshgrid(np.linspace(-sy, sy, rows), np.linspace(-sx, sx, columns), indexing="ij")
+    top = np.column_stack([x.ravel(), y.ravel(), z])
+    index = np.arange(rows * columns).reshape(rows, columns)
+    cells = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1)
+    rim = np.concatenate([index[0], index[1:, -1], index[-1, -2::-1], index[-2:0:-1, 0]])
+    foot = top[rim] * [1.0, 1.0, 0.0] - [0.0, 0.0, base]
+    low = np.arange(len(rim)) + len(top)
+    skirt = np.stack([rim, low, np.roll(low, -1), np.roll(rim, -1)], axis=-1)
+    corners = low[[0, columns - 1, columns + rows - 2, 2 * columns + rows - 3]]
+    quads = np.concatenate([cells.reshape(-1, 4), skirt, corners[None, ::-1]])
+    return np.concatenate([top, foot]), _split(quads)
