@@ -1,6 +1,7 @@
 """The pinhole camera with OpenCV's distortion, and the noise of a range sensor.
 
-Camera frame: x right, y down, z forward. Pixel centres are at integer coordinates. Depth is z, not range.
+Camera frame: x right, y down, z forward. Pixel centres are at integer coordinates.
+Depth is z, not range.
 """
 
 from __future__ import annotations
@@ -45,12 +46,13 @@ class Camera:
     def backproject(self, depth: ArrayLike) -> Array:
         """Return the points (n, 3), metres, of a depth image (height, width) in row order.
 
-        Depth is z in metres; a pixel that is NaN, infinite or not above 0 is no measurement and gives no point.
+        A pixel that is NaN, infinite or not above 0 is no measurement and gives no point.
         """
         z = np.asarray(depth, dtype=np.float64)
         if z.shape != (self.height, self.width):
             raise ValueError(
-                f"depth of shape {z.shape}, expected (height, width) = ({self.height}, {self.width})"
+                f"depth of shape {z.shape},"
+                f" expected (height, width) = ({self.height}, {self.width})"
             )
         seen = np.isfinite(z) & (z > 0)
         points = self._rays[seen] * z[seen][:, None]
@@ -59,7 +61,7 @@ class Camera:
         return np.asarray(points)
 
     def project(self, p_camera: ArrayLike) -> Array:
-        """Return the pixels (n, 2) as (u, v) of points (n, 3), metres; NaN for points not in front (z <= 0)."""
+        """Return the pixels (n, 2), (u, v), of points (n, 3), metres; NaN where z <= 0."""
         p = np.asarray(p_camera, dtype=np.float64)
         z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
         xy = p[..., :2] / z[..., None]
@@ -120,7 +122,7 @@ def _distort(xy: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
 
 
 def _undistort(xy_distorted: Array, distortion: tuple[float, ...]) -> Array:
-    """Invert `_distort` by Newton's method; NaN where there is no preimage on the branch around the centre."""
+    """Invert `_distort` by Newton's method; NaN where the centre's branch does not reach."""
     xy = xy_distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -136,7 +138,8 @@ def _undistort(xy_distorted: Array, distortion: tuple[float, ...]) -> Array:
                 ],
                 axis=-1,
             )
-        value, J = _distort(xy, distortion)
-        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] ** 2
-        good = (np.abs(value - xy_distorted).max(axis=-1) < 1e-9) & (det > 0)
+        good = np.abs(_distort(xy, distortion)[0] - xy_distorted).max(axis=-1) < 1e-9
+        for share in np.linspace(0.125, 1, 8):  # a fold on the way from the centre: another branch
+            J = _distort(share * xy, distortion)[1]
+            good &= J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] ** 2
     return np.asarray(np.where(good[..., None], xy, np.nan))

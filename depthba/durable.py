@@ -16,7 +16,7 @@ PART = ".part"
 
 
 def write_bytes(path: str | Path, data: bytes) -> str:
-    """Put ``data`` at ``path`` at once, on disk when this returns; return its sha256 in hexadecimal."""
+    """Put ``data`` at ``path`` at once, on disk when this returns; return its sha256 in hex."""
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
@@ -39,7 +39,7 @@ def write_text(path: str | Path, text: str) -> str:
 
 
 def write_json(path: str | Path, value: object) -> str:
-    """Put ``value`` at ``path`` as JSON for people (keys in the order given), as `write_bytes` does.
+    """Put ``value`` at ``path`` as JSON for people (keys in their order), as `write_bytes` does.
 
     Raises `ValueError` for NaN and infinity, which JSON does not have.
     """
@@ -72,7 +72,7 @@ def append_line(path: str | Path, line: str) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder and those above it, on disk when this returns; one that is there already is fine."""
+    """Make a folder and those above it, on disk when this returns; it may be there already."""
     path = Path(path)
     missing = [p for p in (path, *path.parents) if not p.exists()]
     path.mkdir(parents=True, exist_ok=True)

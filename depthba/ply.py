@@ -1,6 +1,6 @@
 """Point clouds as binary PLY files.
 
-Written from the description of the format; only what point clouds need: scalar properties of one vertex element.
+Only what point clouds need: the scalar properties of one vertex element.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LONGEST_HEADER = 65536
 
 
 def read_ply_points(path: str | Path) -> NDArray[np.float32]:
-    """Read the points (n, 3) of a binary PLY file, in the file's unit. `DatasetError` names what is wrong."""
+    """Read the points (n, 3) of a binary PLY file. `DatasetError` names what is wrong."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -45,7 +45,7 @@ def read_ply_points(path: str | Path) -> NDArray[np.float32]:
 
 
 def parse_ply_points(data: bytes, name: str) -> NDArray[np.float32]:
-    """Read the points (n, 3) from the bytes of a binary PLY file; ``name`` is for the `DatasetError`."""
+    """Read the points (n, 3) from a binary PLY file's bytes; ``name`` is for the `DatasetError`."""
     order, elements, start = _parse_header(data, name)
     for position, (element, count, properties) in enumerate(elements):
         last = position == len(elements) - 1
@@ -77,7 +77,7 @@ def parse_ply_points(data: bytes, name: str) -> NDArray[np.float32]:
 
 
 def ply_bytes(points: ArrayLike, colours: ArrayLike | None = None) -> bytes:
-    """Return a binary little-endian PLY of points (n, 3), as float32, and colours (n, 3) uint8 RGB or None."""
+    """Return a little-endian PLY of points (n, 3), as float32, and colours (n, 3) uint8 RGB."""
     p = np.asarray(points, dtype=np.float32)
     if p.ndim != 2 or p.shape[1] != 3:
         raise ValueError(f"points of shape {p.shape}, expected (n, 3)")
@@ -100,7 +100,7 @@ def ply_bytes(points: ArrayLike, colours: ArrayLike | None = None) -> bytes:
 
 
 def write_ply(path: str | Path, points: ArrayLike, colours: ArrayLike | None = None) -> None:
-    """Write points (n, 3) and colours (n, 3) uint8 RGB as a binary PLY file, whole or not at all."""
+    """Write points (n, 3) and colours (n, 3) uint8 RGB as a PLY file, whole or not at all."""
     durable.write_bytes(path, ply_bytes(points, colours))
 
 
@@ -108,7 +108,7 @@ _Element = tuple[str, int, list[tuple[str, str]]]
 
 
 def _parse_header(data: bytes, name: str) -> tuple[str, list[_Element], int]:
-    """Return the byte order, the elements with their properties (name, type), and where the data begin."""
+    """Return the byte order, the elements with properties (name, type), and where data begin."""
     lines: list[list[str]] = []
     start = 0
     while True:
@@ -129,7 +129,7 @@ def _parse_header(data: bytes, name: str) -> tuple[str, list[_Element], int]:
                 order = _ORDERS[kind]
             case ["format", *rest]:
                 raise DatasetError(f"{name}: PLY format {' '.join(rest)!r}, expected binary 1.0")
-            case ["element", element, count] if count.isdecimal():
+            case ["element", element, count] if count.isdecimal() and len(count) < 19:
                 elements.append((element, int(count), []))
             case ["property", "list", _, _, field] if elements:
                 elements[-1][2].append((field, "list"))

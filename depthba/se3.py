@@ -1,7 +1,8 @@
-"""Rigid motions as 4x4 matrices, and rotations as rotation vectors. Everything is batched over leading axes.
+"""Rigid motions as 4x4 matrices, rotations as rotation vectors; all batched over leading axes.
 
-A perturbation ``delta = [tau, phi]`` moves a pose in world axes about its own origin: ``R <- Exp(phi) R`` and
-``t <- t + tau``. Translation and rotation stay uncoupled, so a covariance reads in metres and radians.
+A perturbation ``delta = [tau, phi]`` moves a pose in world axes about its own origin:
+``R <- Exp(phi) R`` and ``t <- t + tau``. Translation and rotation stay uncoupled, so a covariance
+reads in metres and radians.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_SERIES_BELOW = 1e-2
+_SERIES_BELOW = 1e-4
 """Squared angle (rad^2) under which the Taylor series is exact to rounding."""
 
 
 def hat(v: ArrayLike) -> Array:
-    """Return the cross-product matrix (..., 3, 3) of vectors (..., 3): ``hat(a) @ b == cross(a, b)``."""
+    """Return the matrices (..., 3, 3) of vectors (..., 3): ``hat(a) @ b == cross(a, b)``."""
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
@@ -25,12 +26,12 @@ def hat(v: ArrayLike) -> Array:
 
 
 def exp_so3(phi: ArrayLike) -> Array:
-    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
+    """Return the matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
     phi = np.asarray(phi, dtype=np.float64)
     s = np.sum(phi * phi, axis=-1)
     small = s < _SERIES_BELOW
     theta = np.sqrt(np.where(small, 1.0, s))
-    # sin(theta)/theta and (1 - cos(theta))/theta^2; the second through the half angle, which does not cancel.
+    # sin(theta)/theta, and (1 - cos(theta))/theta^2 through the half angle, which does not cancel.
     a = np.where(small, 1 + s * (-1 / 6 + s * (1 / 120 - s / 5040)), np.sin(theta) / theta)
     b = np.where(
         small,
@@ -42,7 +43,7 @@ def exp_so3(phi: ArrayLike) -> Array:
 
 
 def log_so3(R: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3), radians, length at most pi, of rotation matrices (..., 3, 3)."""
+    """Return the rotation vectors (..., 3), radians, at most pi long, of matrices (..., 3, 3)."""
     q = _quaternion_of_rotation(np.asarray(R, dtype=np.float64))
     v, w = q[..., :3], q[..., 3]
     n = np.linalg.norm(v, axis=-1)
@@ -54,7 +55,7 @@ def log_so3(R: ArrayLike) -> Array:
 
 
 def make(R: ArrayLike, t: ArrayLike) -> Array:
-    """Return the transforms (..., 4, 4) with rotations (..., 3, 3) and translations (..., 3), metres."""
+    """Return the transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3), m."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
     T = np.zeros((*shape, 4, 4))
@@ -83,15 +84,15 @@ def difference(T_a: ArrayLike, T_b: ArrayLike) -> Array:
 
 
 def align_first(T_est: ArrayLike, T_ref: ArrayLike) -> Array:
-    """Move a whole trajectory (N, 4, 4) rigidly so that its first pose is that of ``T_ref`` (N, 4, 4)."""
+    """Move a trajectory (N, 4, 4) rigidly, so that it begins as ``T_ref`` (N, 4, 4) does."""
     T_est, T_ref = np.asarray(T_est, dtype=np.float64), np.asarray(T_ref, dtype=np.float64)
     return np.asarray(T_ref[0] @ inverse(T_est[0]) @ T_est)
 
 
 def from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Array:
-    """Return transforms (..., 4, 4) from translations (..., 3) and quaternions (..., 4), order x y z w.
+    """Return transforms (..., 4, 4) of translations (..., 3) and quaternions (..., 4), x y z w.
 
-    The quaternion is normalised; one of length zero gives NaN, so check what comes from outside first.
+    The quaternion is normalised; one of length zero gives NaN, so check what comes from outside.
     """
     q = np.asarray(q_xyzw, dtype=np.float64)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -101,12 +102,12 @@ def from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Array:
 
 
 def quaternion(T: ArrayLike) -> Array:
-    """Return the unit quaternions (..., 4), order x y z w with w >= 0, of transforms (..., 4, 4)."""
+    """Return the unit quaternions (..., 4), x y z w with w >= 0, of transforms (..., 4, 4)."""
     return _quaternion_of_rotation(np.asarray(T, dtype=np.float64)[..., :3, :3])
 
 
 def is_rigid(T: ArrayLike, tolerance: float = 1e-5) -> bool:
-    """Tell whether all of ``T`` (..., 4, 4) are finite, proper rigid transforms to ``tolerance``."""
+    """Tell whether all of ``T`` (..., 4, 4) are finite and rigid to ``tolerance``."""
     T = np.asarray(T, dtype=np.float64)
     if T.shape[-2:] != (4, 4) or not np.isfinite(T).all():
         return False
@@ -117,7 +118,7 @@ def is_rigid(T: ArrayLike, tolerance: float = 1e-5) -> bool:
 
 
 def _quaternion_of_rotation(R: Array) -> Array:
-    """Take the row of 4 q q^T with the largest diagonal: no division by a small number for any rotation."""
+    """Take the row of 4 q q^T with the largest diagonal, so that nothing small divides."""
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     xw, yw, zw = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]

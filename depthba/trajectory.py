@@ -1,4 +1,7 @@
-"""Trajectories as TUM text files: ``stamp tx ty tz qx qy qz qw`` a line, seconds and metres, ``#`` for comments."""
+"""Trajectories as TUM text files: ``stamp tx ty tz qx qy qz qw`` a line, seconds and metres.
+
+A ``#`` starts a comment.
+"""
 
 from __future__ import annotations
 
@@ -38,9 +41,10 @@ class Trajectory:
 
 
 def parse_tum(text: str, report: Callable[[int, str], None]) -> Trajectory:
-    """Read a TUM text; ``report`` gets the line number (from 1) and the text of each fault, and may raise.
+    """Read a TUM text; ``report`` gets the line number and text of each fault, and may raise.
 
-    An unterminated last line that is no whole pose was cut off by a crash: it is dropped with a warning.
+    An unterminated last line that is no whole pose was cut off by a crash: it is dropped with a
+    warning.
     """
     lines = text.split("\n")
     unterminated = lines.pop() if lines else ""
@@ -75,7 +79,7 @@ def parse_tum(text: str, report: Callable[[int, str], None]) -> Trajectory:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file. Raises `DatasetError` that names the file where that cannot be done."""
+    """Read a UTF-8 text file. Raises `DatasetError` that names the file."""
     try:
         return Path(path).read_bytes().decode()
     except FileNotFoundError:
@@ -89,7 +93,8 @@ def read_text(path: str | Path) -> str:
 def read_tum(path: str | Path) -> tuple[Array, Array]:
     """Read a TUM file: stamps (N,), seconds, and poses (N, 4, 4), metres.
 
-    Raises `DatasetError` that names the file, line and value. A truncated last line is dropped and logged.
+    Raises `DatasetError` that names the file, line and value. A truncated last line is dropped
+    and logged.
     """
 
     def refuse(line: int, text: str) -> None:
@@ -102,7 +107,7 @@ def read_tum(path: str | Path) -> tuple[Array, Array]:
 
 
 def tum_line(stamp: float, T_world_camera: ArrayLike) -> str:
-    """Return the line of one pose (4, 4), without newline: stamp with 9 decimals, the rest with 15."""
+    """Return the line of one pose (4, 4), no newline: stamp with 9 decimals, the rest with 15."""
     T = np.asarray(T_world_camera, dtype=np.float64)
     values = [*T[:3, 3], *se3.quaternion(T)]
     if not (math.isfinite(stamp) and np.isfinite(values).all()):
@@ -123,7 +128,7 @@ def write_tum(
 
 
 def _parse_line(line: str) -> tuple[list[float], str, bool]:
-    """Return the numbers, the fault or "", and whether a line that was cut off could have this fault."""
+    """Return the numbers, the fault or "", and whether cutting the line off explains it."""
     words = line.partition("#")[0].split()
     if len(words) != 8:
         return [], f"{len(words)} values in {line[:80]!r}, expected 8: {_FIELDS}", len(words) < 8
@@ -137,6 +142,6 @@ def _parse_line(line: str) -> tuple[list[float], str, bool]:
         if not math.isfinite(number):
             return [], f"{field} is {number}, expected a finite number", False
     length = math.hypot(*numbers[4:])
-    if abs(length - 1) > UNIT_TOLERANCE:
+    if abs(length - 1) > UNIT_TOLERANCE * (1 + 1e-6):  # 1 + 1e-6 is not exact in binary
         return [], f"quaternion of length {length:.9g}, expected 1 to {UNIT_TOLERANCE:g}", True
     return numbers, "", False

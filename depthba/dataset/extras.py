@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from depthba.dataset import fields
-from depthba.dataset.faults import Faults, Malformed
+from depthba.dataset.faults import Faults, MalformedError
 from depthba.dataset.model import Marker
 from depthba.errors import DatasetError
 from depthba.trajectory import read_text
@@ -19,7 +19,7 @@ CALIBRATION = "calibration.json"
 
 
 def read_markers(root: Path, ids: Collection[int], faults: Faults) -> tuple[Marker, ...]:
-    """Return the markers of the dataset with frames ``ids``; empty where there is no markers.json."""
+    """Return the markers of a dataset with frames ``ids``; empty without markers.json."""
     raw = _read_json(root, MARKERS, faults)
     if raw is None:
         return ()
@@ -31,7 +31,7 @@ def read_markers(root: Path, ids: Collection[int], faults: Faults) -> tuple[Mark
         with faults.within(MARKERS):
             marker = _marker(value, f"[{index}]", ids, faults)
             if any(marker.name == other.name for other in markers):
-                raise Malformed(
+                raise MalformedError(
                     f"marker {marker.name!r} is there twice, expected names that differ"
                 )
             markers.append(marker)
@@ -39,7 +39,7 @@ def read_markers(root: Path, ids: Collection[int], faults: Faults) -> tuple[Mark
 
 
 def markers_json(markers: Sequence[Marker], ids: Collection[int]) -> list[dict[str, Any]]:
-    """Return what markers.json holds for these markers. `Malformed` where it could not be read back."""
+    """Return what markers.json holds for these markers. `MalformedError`: it could not be read."""
     raw = [
         {
             "name": marker.name,
@@ -55,12 +55,12 @@ def markers_json(markers: Sequence[Marker], ids: Collection[int]) -> list[dict[s
     for index, value in enumerate(raw):
         _marker(value, f"[{index}]", ids, faults)
     if faults.found:
-        raise Malformed(str(faults.found[0]))
+        raise MalformedError(str(faults.found[0]))
     return raw
 
 
 def read_calibration(root: Path, faults: Faults) -> dict[str, Any] | None:
-    """Return calibration.json, or None where there is none. What it says of board and truth is checked."""
+    """Return calibration.json, board and truth checked, or None where there is none."""
     raw = _read_json(root, CALIBRATION, faults)
     if raw is None:
         return None
@@ -107,7 +107,9 @@ def _marker(value: Any, where: str, ids: Collection[int], faults: Faults) -> Mar
     )
     observations = record.get("observations", [])
     if not isinstance(observations, list):
-        raise Malformed(f"{name}.observations is {fields.shown(observations)}, expected a list")
+        raise MalformedError(
+            f"{name}.observations is {fields.shown(observations)}, expected a list"
+        )
     seen = []
     for observation in observations:
         frame: int | None = None
@@ -115,7 +117,7 @@ def _marker(value: Any, where: str, ids: Collection[int], faults: Faults) -> Mar
             raw = fields.mapping(observation, f"observation of {name!r}")
             frame = fields.integer(fields.required(raw, "frame"), f"{name}.frame")
             if frame not in ids:
-                raise Malformed(
+                raise MalformedError(
                     f"marker {name!r} is seen in frame {frame}, which is not in the dataset"
                 )
             p_camera = fields.numbers(

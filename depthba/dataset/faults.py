@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +25,7 @@ class Fault:
         return f"{self.file + ': ' if self.file else ''}{frame}{self.text}"
 
 
-class Malformed(Exception):
+class MalformedError(Exception):
     """A value is wrong; who reads it knows the file and the frame, and adds them."""
 
 
@@ -48,10 +46,24 @@ class Faults:
         if fault not in self.found:
             self.found.append(fault)
 
-    @contextmanager
-    def within(self, file: str, frame: int | None = None) -> Iterator[None]:
-        """Report a `Malformed` raised in the block as a fault of this file and frame."""
-        try:
-            yield
-        except Malformed as error:
-            self.add(file, frame, str(error))
+    def within(self, file: str, frame: int | None = None) -> _Within:
+        """Report a `MalformedError` from the `with` block as a fault of this file and frame."""
+        return _Within(self, file, frame)
+
+
+@dataclass(frozen=True)
+class _Within:
+    faults: Faults
+    file: str
+    frame: int | None
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> bool:
+        if not isinstance(error, MalformedError):
+            return False
+        self.faults.add(self.file, self.frame, str(error))
+        return True

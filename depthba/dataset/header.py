@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from depthba.camera import Camera, RangeNoise
 from depthba.dataset import fields
-from depthba.dataset.faults import Faults, Malformed
+from depthba.dataset.faults import Faults, MalformedError
 from depthba.dataset.sensor import PoseNoise, Sensor
 from depthba.errors import DatasetError
 from depthba.trajectory import read_text
@@ -104,8 +104,8 @@ def _header_text(root: Path) -> str:
 def _check_version(version: Any) -> None:
     fields.integer(version, "version", least=1)
     if version > VERSION:
-        raise Malformed(
-            f"version is {version}, expected {VERSION}: a newer depthba wrote it, and a newer one is needed to read it"
+        raise MalformedError(
+            f"version is {version}, expected {VERSION}: it takes a newer depthba to read it"
         )
 
 
@@ -124,7 +124,9 @@ def _sensor(raw: fields.Record, faults: Faults) -> Sensor | None:
         with faults.within(FILE):
             origin = raw.get("origin", False)
             if not isinstance(origin, bool):
-                raise Malformed(f"sensor.origin is {fields.shown(origin)}, expected true or false")
+                raise MalformedError(
+                    f"sensor.origin is {fields.shown(origin)}, expected true or false"
+                )
     else:
         camera = _camera(raw, faults)
         with faults.within(FILE):

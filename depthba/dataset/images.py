@@ -1,4 +1,4 @@
-"""Depth and colour images as PNG bytes. Depth: 16 bit, one channel, 0 = no measurement. Colour: 8 bit, RGB."""
+"""Images as PNG bytes. Depth: 16 bit, one channel, 0 = no measurement. Colour: 8 bit, RGB."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from depthba.dataset.faults import Malformed
+from depthba.dataset.faults import MalformedError
 from depthba.dataset.sensor import DEPTH_LARGEST, Sensor
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -16,13 +16,13 @@ _CHANNELS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB wi
 _COMPRESSION = 3
 """Fixed, so that equal images give equal bytes; higher levels save little on noisy depth."""
 _ROUNDING = 1e-6
-"""Share of a depth step by which a value may pass depth_min or depth_max: decimal scales are not exact in binary."""
+"""Share of a depth step by which depth_min and depth_max give: decimals are not exact in binary."""
 
 
 def decode_depth(png: bytes, sensor: Sensor) -> NDArray[np.float32]:
     """Return depth (height, width) in metres, NaN where nothing was measured in the sensor's range.
 
-    Raises `Malformed` for bytes that are no 16-bit grey PNG of the sensor's size.
+    Raises `MalformedError` for bytes that are no 16-bit grey PNG of the sensor's size.
     """
     pixels = _decode(png, sensor, bits=16, channels="grey")
     scale = sensor.depth_scale or 1.0
@@ -36,7 +36,10 @@ def decode_depth(png: bytes, sensor: Sensor) -> NDArray[np.float32]:
 
 
 def decode_rgb(png: bytes, sensor: Sensor) -> NDArray[np.uint8]:
-    """Return colour (height, width, 3), RGB. Raises `Malformed` for bytes that are no 8-bit RGB PNG of that size."""
+    """Return colour (height, width, 3), RGB.
+
+    Raises `MalformedError` for bytes that are no 8-bit RGB PNG of the sensor's size.
+    """
     bgr = _decode(png, sensor, bits=8, channels="RGB")
     return np.ascontiguousarray(bgr[..., ::-1]).astype(np.uint8, copy=False)
 
@@ -44,15 +47,19 @@ def decode_rgb(png: bytes, sensor: Sensor) -> NDArray[np.uint8]:
 def encode_depth(depth: ArrayLike, sensor: Sensor) -> bytes:
     """Return the PNG of depth (height, width) in metres; NaN and 0 are no measurement.
 
-    Raises `Malformed` for a shape that is not the sensor's and for a depth that does not fit 16 bits at its scale.
+    Raises `MalformedError` for a shape that is not the sensor's, and for a depth that does not fit
+    16 bits at its scale: nothing wraps.
     """
     z = np.asarray(depth, dtype=np.float64)
     camera, scale = sensor.camera, sensor.depth_scale
     if camera is None or scale is None:
-        raise Malformed(f"a depth image for a sensor of kind {sensor.kind!r}, expected a cloud")
+        raise MalformedError(
+            f"a depth image for a sensor of kind {sensor.kind!r}, expected a cloud"
+        )
     if z.shape != (camera.height, camera.width):
-        raise Malformed(
-            f"depth of shape {z.shape}, expected (height, width) = ({camera.height}, {camera.width})"
+        raise MalformedError(
+            f"depth of shape {z.shape},"
+            f" expected (height, width) = ({camera.height}, {camera.width})"
         )
     with np.errstate(invalid="ignore"):
         steps = np.where(np.isnan(z) | (z == 0), 0.0, np.rint(z / scale))
@@ -60,22 +67,24 @@ def encode_depth(depth: ArrayLike, sensor: Sensor) -> bytes:
     misfit = measured & ~((steps >= 1) & (steps <= DEPTH_LARGEST))
     if misfit.any():
         v, u = (int(i) for i in np.argwhere(misfit)[0])
-        raise Malformed(
-            f"depth {z[v, u]:g} m at pixel (u {u}, v {v}) and {int(misfit.sum()) - 1} more do not fit 16 bits,"
-            f" expected {scale:g} to {DEPTH_LARGEST * scale:g} m (depth_scale {scale:g}), or NaN"
+        raise MalformedError(
+            f"depth {z[v, u]:g} m at pixel (u {u}, v {v}) and {int(misfit.sum()) - 1} more do not"
+            f" fit 16 bits, expected {scale:g} to {DEPTH_LARGEST * scale:g} m"
+            f" (depth_scale {scale:g}) or NaN"
         )
     return _encode(steps.astype(np.uint16))
 
 
 def encode_rgb(rgb: ArrayLike, sensor: Sensor) -> bytes:
-    """Return the PNG of colour (height, width, 3) uint8, RGB. Raises `Malformed` for another shape or type."""
+    """Return the PNG of colour (height, width, 3) uint8, RGB. `MalformedError`: it is not that."""
     pixels = np.asarray(rgb)
     camera = sensor.camera
     if camera is None:
-        raise Malformed(f"a colour image for a sensor of kind {sensor.kind!r}, expected none")
+        raise MalformedError(f"a colour image for a sensor of kind {sensor.kind!r}, expected none")
     if pixels.shape != (camera.height, camera.width, 3) or pixels.dtype != np.uint8:
-        raise Malformed(
-            f"rgb of shape {pixels.shape} {pixels.dtype}, expected ({camera.height}, {camera.width}, 3) uint8"
+        raise MalformedError(
+            f"rgb of shape {pixels.shape} {pixels.dtype},"
+            f" expected ({camera.height}, {camera.width}, 3) uint8"
         )
     return _encode(np.ascontiguousarray(pixels[..., ::-1]))
 
@@ -85,17 +94,17 @@ def _encode(pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
 
     written, png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION])
     if not written:
-        raise Malformed("the image could not be written as PNG")
+        raise MalformedError("the image could not be written as PNG")
     return bytes(png.tobytes())
 
 
 def _decode(
     png: bytes, sensor: Sensor, *, bits: int, channels: str
 ) -> NDArray[np.uint16] | NDArray[np.uint8]:
-    """Decode what `_check` has found to be whole, so that the decoder has nothing to complain about."""
+    """Decode what `_check` found whole, so that the decoder has nothing to print on stderr."""
     camera = sensor.camera
     if camera is None:
-        raise Malformed(f"an image of a sensor of kind {sensor.kind!r}, expected none")
+        raise MalformedError(f"an image of a sensor of kind {sensor.kind!r}, expected none")
     _check(png, camera.width, camera.height, bits, channels)
     import cv2
 
@@ -103,39 +112,44 @@ def _decode(
     shape = (camera.height, camera.width) + ((3,) if channels == "RGB" else ())
     dtype: type = np.uint16 if bits == 16 else np.uint8
     if pixels is None or pixels.shape != shape or pixels.dtype != dtype:
-        raise Malformed("PNG that cannot be decoded")
-    return pixels  # type: ignore[no-any-return,unused-ignore]
+        raise MalformedError("PNG that cannot be decoded")
+    return np.asarray(pixels, dtype=dtype)
 
 
 def _check(png: bytes, width: int, height: int, bits: int, channels: str) -> None:
-    """Refuse bytes that are no whole PNG of the expected size and type, before anything is decoded."""
+    """Refuse bytes that are no whole PNG of that size and type, before anything is decoded."""
     if not png.startswith(_SIGNATURE):
-        raise Malformed(f"begins with {png[:8]!r}, expected a PNG file")
-    at, kind, header, raw = len(_SIGNATURE), b"", b"", b""
+        raise MalformedError(f"begins with {png[:8]!r}, expected a PNG file")
+    at, kind, header, packed = len(_SIGNATURE), b"", b"", []
     while kind != b"IEND":
         if at + 12 > len(png):
-            raise Malformed(f"PNG of {len(png)} bytes is cut off")
+            raise MalformedError(f"PNG of {len(png)} bytes is cut off")
         length, kind = struct.unpack_from(">I4s", png, at)
         end = at + 12 + length
         if end > len(png):
-            raise Malformed(f"PNG of {len(png)} bytes is cut off, expected {end} or more")
+            raise MalformedError(f"PNG of {len(png)} bytes is cut off, expected {end} or more")
         body = png[at + 8 : end - 4]
         if zlib.crc32(png[at + 4 : end - 4]) != struct.unpack_from(">I", png, end - 4)[0]:
-            raise Malformed(f"PNG chunk {kind.decode('latin-1')!r} has a wrong check sum")
+            raise MalformedError(f"PNG chunk {kind.decode('latin-1')!r} has a wrong check sum")
         if not header:
             header = body
         if kind == b"IDAT":
-            raw += body
+            packed.append(body)
         at = end
     if len(header) != 13:
-        raise Malformed("PNG without an image header")
-    found_width, found_height, found_bits, colour = struct.unpack_from(">IIBB", header)
+        raise MalformedError("PNG without an image header")
+    found_width, found_height, found_bits, colour, *_, interlace = struct.unpack(">IIBBBBB", header)
     found = _CHANNELS.get(colour, f"colour type {colour}")
     if (found_bits, found) != (bits, channels):
-        raise Malformed(f"PNG of {found_bits} bit {found}, expected {bits} bit {channels}")
+        raise MalformedError(f"PNG of {found_bits} bit {found}, expected {bits} bit {channels}")
     if (found_width, found_height) != (width, height):
-        raise Malformed(
+        raise MalformedError(
             f"PNG of {found_width} x {found_height} pixels, expected {width} x {height}"
         )
-    if not raw:
-        raise Malformed("PNG without image data")
+    size = height * (1 + width * bits // 8 * (3 if channels == "RGB" else 1))
+    try:
+        unpacked = zlib.decompressobj().decompress(b"".join(packed), size + 1)
+    except zlib.error as error:
+        raise MalformedError(f"PNG whose image data cannot be unpacked: {error}") from error
+    if not interlace and len(unpacked) != size:
+        raise MalformedError(f"PNG with {len(unpacked)} bytes of image data, expected {size}")

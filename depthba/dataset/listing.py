@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.dataset import fields
-from depthba.dataset.faults import Faults, Malformed
-from depthba.dataset.model import StoredFile
+from depthba.dataset.faults import Faults, MalformedError
+from depthba.dataset.model import Frame, StoredFile
 from depthba.errors import DatasetError
 from depthba.trajectory import Trajectory, parse_tum, read_text
 
 Array = NDArray[np.float64]
 
 FILE = "frames.jsonl"
+_STRANGE = re.compile(r"[\\\x00-\x1f]|^[A-Za-z]:")
+"""In a path: what separates or names a drive on Windows, and what no name should have."""
 STAMP_TOLERANCE = 1e-6
 """Stamps that differ by no more are the same, seconds."""
 
@@ -43,7 +46,7 @@ def pose_file(name: str) -> str:
 
 
 def read_entries(root: Path, kind: str | None, faults: Faults) -> tuple[list[Entry], list[str]]:
-    """Return the frames that frames.jsonl lists, and warnings. ``kind`` is the sensor's, None where unknown."""
+    """Return the frames of frames.jsonl, and warnings; ``kind`` is the sensor's, if known."""
     try:
         lines = _lines(root / FILE)
     except DatasetError as error:
@@ -60,7 +63,7 @@ def read_entries(root: Path, kind: str | None, faults: Faults) -> tuple[list[Ent
         last = index == len(lines)
         try:
             record = fields.mapping(fields.parse(_decoded(line)), "it")
-        except Malformed as error:
+        except MalformedError as error:
             if last:
                 shown = line[:60].decode(errors="replace")
                 warnings.append(
@@ -91,51 +94,53 @@ def read_poses(root: Path, name: str, faults: Faults) -> Trajectory | None:
 
 
 def rows_of(stamps: Sequence[float], trajectory: Trajectory) -> list[NDArray[np.int64]]:
-    """Return for each stamp the poses of the trajectory with that stamp: one index, if all is well."""
+    """Return for each stamp the indices of the poses that have it: one, if all is well."""
     order = np.argsort(trajectory.stamps, kind="stable")
     known = trajectory.stamps[order]
     wanted = np.asarray(stamps, dtype=np.float64)
-    # Seconds since 1970 have steps of 2e-7 in double precision, so the tolerance grows by a few of them.
+    # Seconds since 1970 come in steps of 2e-7, so the tolerance grows by a few steps.
     tolerance = STAMP_TOLERANCE + 4 * np.spacing(np.abs(wanted))
     first = np.searchsorted(known, wanted - tolerance, side="left")
     end = np.searchsorted(known, wanted + tolerance, side="right")
     return [order[a:b] for a, b in zip(first, end, strict=True)]
 
 
-def join(entries: Sequence[Entry], trajectory: Trajectory, name: str, faults: Faults) -> Array:
+def join(
+    frames: Sequence[Entry | Frame], trajectory: Trajectory, name: str, faults: Faults
+) -> Array:
     """Return the pose of each frame, (N, 4, 4); NaN where a fault was reported instead."""
-    poses = np.full((len(entries), 4, 4), np.nan)
+    poses = np.full((len(frames), 4, 4), np.nan)
     file = pose_file(name)
-    rows = rows_of([entry.stamp for entry in entries], trajectory)
-    for i, (entry, row) in enumerate(zip(entries, rows, strict=True)):
+    rows = rows_of([frame.stamp for frame in frames], trajectory)
+    for i, (frame, row) in enumerate(zip(frames, rows, strict=True)):
         if len(row) == 1:
             poses[i] = trajectory.T_world_camera[row[0]]
             continue
         found = "no pose" if len(row) == 0 else f"{len(row)} poses"
         near = ""
         if len(row) == 0 and len(trajectory.stamps):
-            gaps = np.abs(trajectory.stamps - entry.stamp)
+            gaps = np.abs(trajectory.stamps - frame.stamp)
             near = f" (the nearest is at {trajectory.stamps[np.argmin(gaps)]:.9f})"
-        text = f"{found} with stamp {entry.stamp:.9f}, expected one to {STAMP_TOLERANCE:g} s{near}"
-        faults.add(file, entry.id, text)
+        text = f"{found} with stamp {frame.stamp:.9f}, expected one to {STAMP_TOLERANCE:g} s{near}"
+        faults.add(file, frame.id, text)
     return poses
 
 
 def inside(root: Path, path: str) -> None:
     """Refuse a path that leaves the dataset, by its text or through a link."""
     pure = PurePosixPath(path)
-    if not path or pure.is_absolute() or ".." in pure.parts or set(path) & set("\\:\0\n"):
-        raise Malformed(
+    if not path or pure.is_absolute() or ".." in pure.parts or _STRANGE.search(path):
+        raise MalformedError(
             f"path {fields.shown(path)}, expected one inside the dataset, relative, without '..'"
         )
     try:
         target = (root / path).resolve()
         home = root.resolve()
     except (OSError, RuntimeError) as error:
-        raise Malformed(f"path {fields.shown(path)} cannot be followed: {error}") from error
+        raise MalformedError(f"path {fields.shown(path)} cannot be followed: {error}") from error
     if not target.is_relative_to(home):
-        raise Malformed(
-            f"path {fields.shown(path)} leads out of the dataset through a link, expected one inside"
+        raise MalformedError(
+            f"path {fields.shown(path)} is a link out of the dataset, expected one inside"
         )
 
 
@@ -153,21 +158,20 @@ def _decoded(line: bytes) -> str:
     try:
         return line.decode()
     except UnicodeDecodeError as error:
-        raise Malformed(f"byte {error.start} is not UTF-8, expected JSON") from error
+        raise MalformedError(f"byte {error.start} is not UTF-8, expected JSON") from error
 
 
 def _entry(
     root: Path, line: str, number: int, record: dict[str, Any], kind: str | None, faults: Faults
 ) -> Entry | None:
     """Check one line, every part on its own, so that all faults come out at once."""
-    before = len(faults.found)
     frame: int | None = None
-    stamp = 0.0
+    stamp: float | None = None
     with faults.within(FILE, None):
         try:
             frame = fields.integer(fields.required(record, "id"), "id")
-        except Malformed as error:
-            raise Malformed(f"line {number}: {error}") from error
+        except MalformedError as error:
+            raise MalformedError(f"line {number}: {error}") from error
     with faults.within(FILE, frame):
         stamp = fields.number(fields.required(record, "stamp"), "stamp")
     joints, T_base_flange = None, None
@@ -179,7 +183,7 @@ def _entry(
         if record.get("T_base_flange") is not None:
             T_base_flange = fields.rigid(record["T_base_flange"], "T_base_flange")
     files = _files(root, record, kind, frame, faults)
-    if frame is None or len(faults.found) > before:
+    if frame is None or stamp is None:
         return None
     return Entry(line, frame, stamp, files, joints, T_base_flange, record)
 
@@ -200,7 +204,7 @@ def _files(
             path = fields.text(fields.required(record, name), name)
             inside(root, path)
             if name not in hashes:
-                raise Malformed(f"sha256 of {name!r} is missing")
+                raise MalformedError(f"sha256 of {name!r} is missing")
             files[name] = StoredFile(path, _sha256(hashes[name], f"sha256.{name}"))
     return files
 
@@ -208,7 +212,7 @@ def _files(
 def _sha256(value: Any, name: str) -> str:
     digest = fields.text(value, name).lower()
     if len(digest) != 64 or set(digest) - set("0123456789abcdef"):
-        raise Malformed(f"{name} is {fields.shown(value)}, expected 64 hexadecimal digits")
+        raise MalformedError(f"{name} is {fields.shown(value)}, expected 64 hexadecimal digits")
     return digest
 
 

@@ -1,4 +1,4 @@
-"""The files of a frame: read once, checked against their sha256, decoded. All raise `Malformed`."""
+"""The files of a frame: read once, checked against their sha256, decoded, or `MalformedError`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from depthba import ply
 from depthba.dataset import images
-from depthba.dataset.faults import Malformed
+from depthba.dataset.faults import MalformedError
 from depthba.dataset.sensor import Sensor
 from depthba.errors import DatasetError
 
@@ -19,13 +19,13 @@ def load_bytes(path: Path, sha256: str) -> bytes:
     """Return the bytes of a file whose sha256 is as listed."""
     try:
         if path.exists() and not path.is_file():  # reading a pipe would wait for ever
-            raise Malformed("not a regular file")
+            raise MalformedError("not a regular file")
         data = path.read_bytes()
     except OSError as error:
-        raise Malformed(f"{error.strerror}, expected a readable file") from error
+        raise MalformedError(f"{error.strerror}, expected a readable file") from error
     found = hashlib.sha256(data).hexdigest()
     if found != sha256:
-        raise Malformed(f"sha256 is {found}, expected {sha256}: its bytes have changed")
+        raise MalformedError(f"sha256 is {found}, expected {sha256}: its bytes have changed")
     return data
 
 
@@ -45,12 +45,12 @@ def load_cloud(path: Path, sha256: str, sensor: Sensor) -> NDArray[np.float32]:
     try:
         points = ply.parse_ply_points(data, path.name)
     except DatasetError as error:
-        raise Malformed(str(error).removeprefix(f"{path.name}: ")) from error
+        raise MalformedError(str(error).removeprefix(f"{path.name}: ")) from error
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
         found = ", ".join(f"{v:g}" for v in points[row])
-        raise Malformed(f"point {row} is ({found}), expected finite coordinates")
+        raise MalformedError(f"point {row} is ({found}), expected finite coordinates")
     seen = np.ones(len(points), dtype=bool)
     if sensor.depth_min is not None:
         seen &= points[:, 2] >= sensor.depth_min

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.dataset import loading
-from depthba.dataset.faults import Malformed
+from depthba.dataset.faults import MalformedError
 from depthba.dataset.sensor import Sensor
 from depthba.errors import DatasetError
 
@@ -30,7 +30,7 @@ class StoredFile:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame. What it loads is checked against its sha256, and `DatasetError` names what is wrong."""
+    """One frame. What it loads is checked by its sha256; `DatasetError` names what is wrong."""
 
     id: int
     """Unique in the dataset, rising."""
@@ -51,11 +51,11 @@ class Frame:
     """The whole line of frames.jsonl, unknown keys too."""
 
     def depth(self) -> NDArray[np.float32]:
-        """Return depth (height, width) in metres; NaN where nothing was measured or the value is out of range."""
+        """Return depth (height, width), metres; NaN where nothing was measured in range."""
         stored = self._stored("depth")
         try:
             return loading.load_depth(self.root / stored.path, stored.sha256, self.sensor)
-        except Malformed as error:
+        except MalformedError as error:
             raise self._error(stored, error) from error
 
     def rgb(self) -> NDArray[np.uint8] | None:
@@ -65,7 +65,7 @@ class Frame:
         stored = self._stored("rgb")
         try:
             return loading.load_rgb(self.root / stored.path, stored.sha256, self.sensor)
-        except Malformed as error:
+        except MalformedError as error:
             raise self._error(stored, error) from error
 
     def points(self) -> NDArray[np.float32]:
@@ -78,7 +78,7 @@ class Frame:
         stored = self._stored("cloud")
         try:
             return loading.load_cloud(self.root / stored.path, stored.sha256, self.sensor)
-        except Malformed as error:
+        except MalformedError as error:
             raise self._error(stored, error) from error
 
     def _stored(self, kind: str) -> StoredFile:
@@ -87,7 +87,7 @@ class Frame:
             raise DatasetError(f"{self.root}: frame {self.id}: has no {kind!r}, only {here}")
         return self.files[kind]
 
-    def _error(self, stored: StoredFile, error: Malformed) -> DatasetError:
+    def _error(self, stored: StoredFile, error: MalformedError) -> DatasetError:
         return DatasetError(f"{self.root / stored.path}: frame {self.id}: {error}")
 
 

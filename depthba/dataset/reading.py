@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +29,7 @@ class Dataset:
     name: str
     sensor: Sensor
     map_frame: Literal["world", "auto"]
-    """``world``: the world's x-y plane is the plane of the depth map. ``auto``: the registration chooses."""
+    """``world``: the depth map lies over the world's x-y plane. ``auto``: registration chooses."""
     seed: int | None
     pose_noise: PoseNoise | None
     """Believed accuracy of the measured poses, None where unknown."""
@@ -44,9 +43,12 @@ class Dataset:
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
-        """Open the dataset folder ``path``: its metadata and poses are checked strictly, its images not touched.
+        """Open the dataset folder ``path``.
 
-        Raises `DatasetError`, one line that names the file, the frame, the value and what was expected.
+        Its metadata and poses are checked strictly, its images are not touched.
+
+        Raises `DatasetError`, one line that names the file, the frame, the value and what was
+        expected.
         """
         root = Path(path)
         faults = Faults(root)
@@ -125,7 +127,7 @@ class Dataset:
 
     @property
     def T_world_camera_true(self) -> Array | None:
-        """(N, 4, 4), the truth, or None where it is not known. `DatasetError` where frames are missing in it."""
+        """(N, 4, 4), the truth, or None where it is not known. `DatasetError`: a frame lacks it."""
         if not (self.path / pose_file("true")).exists():
             return None
         return self.poses("true")
@@ -133,12 +135,12 @@ class Dataset:
     def poses(self, name: str) -> Array:
         """Return the poses (N, 4, 4) of poses_<name>.txt, joined to the frames by stamp.
 
-        Raises `DatasetError` where there is no such file, it is malformed, or a frame has no pose in it.
+        Raises `DatasetError` where there is no such file, it is malformed, or a frame has no pose.
         """
         if not (self.path / pose_file(name)).exists() or Path(name).name != name:
             here = sorted(p.name[6:-4] for p in self.path.glob(pose_file("*")))
             raise DatasetError(f"{self.path}: no poses {name!r}, expected one of {', '.join(here)}")
-        return _poses(self.path, name, self._entries, Faults(self.path))[0]
+        return _poses(self.path, name, self.frames, Faults(self.path))[0]
 
     def markers(self) -> tuple[Marker, ...]:
         """Return the markers with known position; empty where there is no markers.json."""
@@ -148,14 +150,12 @@ class Dataset:
         """Return calibration.json, checked, or None where there is none."""
         return read_calibration(self.path, Faults(self.path))
 
-    @cached_property
-    def _entries(self) -> list[Entry]:
-        return [Entry("", f.id, f.stamp, f.files, None, None, {}) for f in self.frames]
 
-
-def _poses(root: Path, name: str, entries: list[Entry], faults: Faults) -> tuple[Array, list[str]]:
+def _poses(
+    root: Path, name: str, frames: Sequence[Entry | Frame], faults: Faults
+) -> tuple[Array, list[str]]:
     """Return the frames' poses (N, 4, 4) and warnings; ``faults`` is strict."""
     trajectory = read_poses(root, name, faults)
     assert trajectory is not None
     warnings = [f"{root / pose_file(name)}: {text}" for text in trajectory.warnings]
-    return join(entries, trajectory, name, faults), warnings
+    return join(frames, trajectory, name, faults), warnings

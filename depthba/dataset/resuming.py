@@ -8,20 +8,23 @@ from pathlib import Path
 
 from depthba import durable
 from depthba.dataset import extras, loading
-from depthba.dataset.faults import Faults, Malformed
+from depthba.dataset.faults import Faults, MalformedError
 from depthba.dataset.listing import FILE, Entry, pose_file, read_entries, read_poses, rows_of
+from depthba.errors import DatasetError
 from depthba.trajectory import Trajectory
 
 
 def recover(root: Path, kind: str, pose_comment: str) -> tuple[list[Entry], bool | None, list[str]]:
     """Bring the dataset ``root`` back to its longest whole prefix.
 
-    Returns the frames kept, whether they have truth (None: there are none to tell), and what was dropped.
+    Returns the frames kept, whether they have truth (None: there are none to tell), and what was
+    dropped.
     """
     faults = Faults(root)
-    entries, warnings = [], []
-    if (root / FILE).exists():
-        entries, warnings = read_entries(root, kind, faults)
+    if not (root / FILE).exists():
+        _refuse_lost_listing(root, kind)
+        durable.write_text(root / FILE, "")
+    entries, warnings = read_entries(root, kind, faults)
     poses: dict[str, Trajectory] = {}
     for name in ("measured", "true"):
         if (root / pose_file(name)).exists():
@@ -34,10 +37,10 @@ def recover(root: Path, kind: str, pose_comment: str) -> tuple[list[Entry], bool
     kept, dropped = entries[:whole], entries[whole:]
     if dropped:
         aside = _set_aside(root, kept, dropped, poses)
-        ids = ", ".join(str(entry.id) for entry in dropped)
-        warnings.append(
-            f"{root}: dropped frames {ids} ({reason}); what was left of them is in {aside.name}"
-        )
+        ids = f"frame {dropped[0].id}"
+        if len(dropped) > 1:
+            ids = f"{len(dropped)} frames from {dropped[0].id} to {dropped[-1].id}"
+        warnings.append(f"{root}: dropped {ids} ({reason}), set aside in {aside.name}")
     _rewrite(root / FILE, [entry.line for entry in kept])
     for name, trajectory in poses.items():
         warnings += _rewrite_poses(root, name, trajectory, kept, dropped)
@@ -57,7 +60,7 @@ def _whole(root: Path, entries: Sequence[Entry], poses: dict[str, Trajectory]) -
         for stored in entry.files.values():
             try:
                 loading.load_bytes(root / stored.path, stored.sha256)
-            except Malformed as error:
+            except MalformedError as error:
                 return i, f"{stored.path}: frame {entry.id}: {error}"
         for name in {"measured", *poses}:
             if name not in rows or len(rows[name][i]) != 1:
@@ -116,6 +119,15 @@ def _rewrite(path: Path, lines: Sequence[str]) -> None:
     data = "".join(line + "\n" for line in lines).encode()
     if not path.exists() or path.read_bytes() != data:
         durable.write_bytes(path, data)
+
+
+def _refuse_lost_listing(root: Path, kind: str) -> None:
+    """Without the listing all frames would count as uncommitted, and new ones overwrite them."""
+    if any((root / kind).glob("*.*")):
+        raise DatasetError(
+            f"{root / FILE}: no such file, though there are files in {kind}; expected the listing"
+            " (an empty one, if none of them counts)"
+        )
 
 
 def _remove_parts(root: Path) -> None:

@@ -15,7 +15,8 @@ from depthba.dataset.sensor import Sensor
 def verify(path: str | Path) -> list[Fault]:
     """Read all of a dataset, images too, and return every fault; empty where it is sound.
 
-    Never raises for a bad dataset. What `Dataset.open` only warns of (a truncated last line) is no fault.
+    Never raises for a bad dataset. What `Dataset.open` only warns of, such as a truncated last
+    line, is no fault.
     """
     root = Path(path)
     faults = Faults(root, strict=False)

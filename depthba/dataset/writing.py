@@ -1,7 +1,7 @@
 """Writing a dataset so that a crash at any instant loses nothing that was committed.
 
-A frame's files come first, then its lines in poses_*.txt, and last its line in frames.jsonl, which is the commit; each is on
-disk before the next begins.
+A frame's files come first, then its lines in poses_*.txt, and last its line in frames.jsonl, which
+is the commit; each is on disk before the next begins.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from depthba import durable, ply, se3
 from depthba.dataset import extras, fields, images, listing
 from depthba.dataset import header as header_file
-from depthba.dataset.faults import Faults, Malformed
+from depthba.dataset.faults import Faults, MalformedError
 from depthba.dataset.listing import Entry, pose_file
 from depthba.dataset.model import Marker
 from depthba.dataset.resuming import recover
@@ -51,8 +51,8 @@ class DatasetWriter:
     def create(path: str | Path, header: Mapping[str, Any]) -> DatasetWriter:
         """Begin a dataset in ``path``, which must not exist or be empty.
 
-        ``header`` is the object of dataset.json; ``format`` and ``version`` are filled in where they are missing.
-        Raises `DatasetError` for a header that could not be read back, and where something is in the way.
+        ``header`` is the object of dataset.json; ``format`` and ``version`` may be left out. Raises
+        `DatasetError` for a header that could not be read back, and where something is in the way.
         """
         root = Path(path)
         try:
@@ -83,9 +83,9 @@ class DatasetWriter:
     def resume(path: str | Path) -> DatasetWriter:
         """Go on with a dataset after a stop or a crash.
 
-        Keeps the longest prefix of frames whose files are whole and that have their poses, sets anything listed
-        behind it aside in a folder ``dropped-<n>``, and says so in ``warnings``. Raises `DatasetError` for a
-        dataset that is wrong in a way that no crash explains.
+        Keeps the longest prefix of frames whose files are whole and that have their poses, sets
+        what is listed behind it aside in a folder ``dropped-<n>``, and says so in ``warnings``.
+        Raises `DatasetError` for a dataset that is wrong in a way that no crash explains.
         """
         root = Path(path)
         header = header_file.read_header(root, Faults(root))
@@ -124,25 +124,26 @@ class DatasetWriter:
     ) -> int:
         """Commit one frame and return its id; it is on disk when this returns.
 
-        Give ``depth`` (height, width), metres, NaN or 0 where nothing was measured, with ``rgb`` (height, width, 3)
-        uint8 if there is one; or ``cloud`` (n, 3), metres, in the sensor frame, rows with NaN left out. Poses are
-        (4, 4). Truth is given for all frames or for none.
+        Give ``depth`` (height, width), metres, NaN or 0 where nothing was measured, with ``rgb``
+        (height, width, 3) uint8 if there is one; or ``cloud`` (n, 3), metres, in the sensor frame,
+        of which rows with NaN are left out. Poses are (4, 4). Truth comes with all frames or none.
 
-        Raises `DatasetError` for what could not be read back, before anything is written; and where the disk
-        fails, after which only `resume` goes on.
+        Raises `DatasetError` for what could not be read back, before anything is written; and where
+        the disk fails, after which only `resume` goes on.
         """
         frame = self._next_id()
         with self._reported(frame):
             stamp = fields.number(float(stamp), "stamp")
             if any(abs(stamp - other) <= 2 * listing.STAMP_TOLERANCE for other in self._stamps):
-                raise Malformed(f"stamp {stamp:.9f} is taken, expected one of its own")
+                raise MalformedError(f"stamp {stamp:.9f} is taken, expected one of its own")
             poses = {"measured": _rigid(T_world_camera, "T_world_camera")}
             if T_world_camera_true is not None:
                 poses["true"] = _rigid(T_world_camera_true, "T_world_camera_true")
             truth = T_world_camera_true is not None
             if self._truth is not None and truth != self._truth:
-                raise Malformed(
-                    f"T_world_camera_true is {'given' if truth else 'missing'}, expected it for all frames or none"
+                raise MalformedError(
+                    f"T_world_camera_true is {'given' if truth else 'missing'},"
+                    " expected it for all frames or none"
                 )
             record: dict[str, Any] = {"id": frame, "stamp": stamp}
             files = self._encode(depth, cloud, rgb)
@@ -176,10 +177,10 @@ class DatasetWriter:
         return frame
 
     def write_markers(self, markers: Sequence[Marker]) -> None:
-        """Write markers.json, in place of one that is there. `DatasetError` for a frame that is not committed."""
+        """Write markers.json, over one that is there. `DatasetError`: a frame is not committed."""
         try:
             raw = extras.markers_json(markers, set(self._ids))
-        except Malformed as error:
+        except MalformedError as error:
             raise DatasetError(f"{self.path / extras.MARKERS}: {error}") from error
         with _disk(self.path):
             durable.write_json(self.path / extras.MARKERS, raw)
@@ -189,12 +190,13 @@ class DatasetWriter:
     ) -> dict[str, bytes]:
         given = [n for n, v in (("depth", depth), ("cloud", cloud)) if v is not None]
         if given != [self.sensor.kind]:
-            raise Malformed(
-                f"{' and '.join(given) or 'nothing'} given, expected {self.sensor.kind} as sensor.kind says"
+            raise MalformedError(
+                f"{' and '.join(given) or 'nothing'} given,"
+                f" expected {self.sensor.kind} as sensor.kind says"
             )
         if cloud is not None:
             if rgb is not None:
-                raise Malformed("rgb given with a cloud, expected it with depth only")
+                raise MalformedError("rgb given with a cloud, expected it with depth only")
             return {"cloud": _encode_cloud(cloud)}
         assert depth is not None  # sensor.kind is depth
         files = {"depth": images.encode_depth(depth, self.sensor)}
@@ -210,7 +212,7 @@ class DatasetWriter:
             durable.append_line(file, tum_line(stamp, T_world_camera))
 
     def _next_id(self) -> int:
-        """Never one whose files a committed frame has, even where another program named the files."""
+        """Never one whose files a committed frame has, even where another program named them."""
         frame = self._ids[-1] + 1 if self._ids else 0
         while self._paths & {_file(name, frame) for name in ("depth", "rgb", "cloud")}:
             frame += 1
@@ -225,14 +227,15 @@ class DatasetWriter:
             size = (self.path / listing.FILE).stat().st_size
         if size != self._size:
             raise DatasetError(
-                f"{self.path / listing.FILE}: {size} bytes, expected {self._size}: another program writes to it"
+                f"{self.path / listing.FILE}: {size} bytes, expected {self._size}:"
+                " another program writes to it"
             )
 
     @contextlib.contextmanager
     def _reported(self, frame: int) -> Iterator[None]:
         try:
             yield
-        except Malformed as error:
+        except MalformedError as error:
             raise DatasetError(f"{self.path}: frame {frame}: {error}") from error
 
 
@@ -243,17 +246,21 @@ def _file(name: str, frame: int) -> str:
 def _rigid(T: ArrayLike, name: str) -> NDArray[np.float64]:
     T = np.asarray(T, dtype=np.float64)
     if not se3.is_rigid(T) or T.shape != (4, 4):
-        raise Malformed(f"{name} is {fields.shown(T.tolist())}, expected a rigid transform (4, 4)")
+        raise MalformedError(
+            f"{name} is {fields.shown(T.tolist())}, expected a rigid transform (4, 4)"
+        )
     return T
 
 
 def _encode_cloud(cloud: ArrayLike) -> bytes:
     points = np.asarray(cloud, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise Malformed(f"cloud of shape {points.shape}, expected (n, 3)")
+        raise MalformedError(f"cloud of shape {points.shape}, expected (n, 3)")
     points = points[~np.isnan(points).any(axis=1)]
     if (np.abs(points) > np.finfo(np.float32).max).any():
-        raise Malformed("cloud has a coordinate that does not fit float32, expected metres or NaN")
+        raise MalformedError(
+            "cloud has a coordinate that does not fit float32, expected metres or NaN"
+        )
     return ply.ply_bytes(points)
 
 
