@@ -39,6 +39,11 @@ class Spreads:
     before: CellSpread
     after: CellSpread
 
+    @property
+    def top(self) -> float:
+        """Where the colours of both end, mm: most of what the start shows."""
+        return 1e3 * float(np.nanmax([self.before.quantile(0.9), self.after.quantile(0.5), 1e-6]))
+
 
 def spreads(
     result: Result, dataset: Dataset, clouds: Sequence[FrameCloud], roi: Sequence[float] | None
@@ -80,7 +85,7 @@ def map_picture(
     box = _extent(result.depth_map)
     width, height = box[1] - box[0], box[3] - box[2]
     panel = np.clip(6.2 * height / width, 2.2, 7.5)
-    figure = _figure(14.5, 2 * panel + 2.1)
+    figure = _figure(14.5, 2 * panel + 1.6)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, depth_map, title in zip(
         axes[0], (result.depth_map_start, result.depth_map), (BEFORE, AFTER), strict=True
@@ -88,9 +93,8 @@ def map_picture(
         relief = _draw_relief(ax, depth_map, _height_range(result))
         ax.set_title(f"Map. {title}", loc="left", fontweight="bold")
     _bar(figure, relief, axes[0], "height (m)")
-    top = _spread_top(both)
     for ax, spread, title in zip(axes[1], (both.before, both.after), (BEFORE, AFTER), strict=True):
-        image = _draw_spread(ax, spread, top)
+        image = _draw_spread(ax, spread, both.top)
         ax.set_title(f"Disagreement of frames. {title}", loc="left", fontweight="bold")
         ax.set_title(f"median {millimetres(spread.quantile(0.5))}", loc="right")
     _bar(figure, image, axes[1], "spread of the frames' heights (mm)", extend="max")
@@ -105,7 +109,7 @@ def map_picture(
         f"{millimetres(result.depth_map.spacing)}, {result.status.replace('_', ' ')}",
         fontsize=14,
     )
-    _save(figure, path, dpi=110)
+    _save(figure, path, dpi=100)
 
 
 def before_after(
@@ -129,14 +133,13 @@ def before_after(
     clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
     both = spreads(result, dataset, clouds, options.roi if options else None)
     box = _extent(result.depth_map)
-    panel = np.clip(4.6 * (box[3] - box[2]) / (box[1] - box[0]), 1.8, 5.5)
-    figure = _figure(15.0, panel + 1.1)
+    panel = np.clip(4.35 * (box[3] - box[2]) / (box[1] - box[0]), 1.8, 5.5)
+    figure = _figure(15.0, panel + 0.6)
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    top = _spread_top(both)
     for ax, spread, title in zip(
         axes[:2], (both.before, both.after), ("Start poses", "After depthba"), strict=True
     ):
-        image = _draw_spread(ax, spread, top)
+        image = _draw_spread(ax, spread, both.top)
         median = millimetres(spread.quantile(0.5))
         ax.set_title(f"{title}: frames disagree by {median}", fontweight="bold")
     _bar(figure, image, axes[:2], "spread between frames (mm)", extend="max")
@@ -151,6 +154,18 @@ def before_after(
     _save(figure, path, dpi=100)
 
 
+def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
+    """Return the spread alone, from above with axes and colours up to ``top`` mm, as PNG."""
+    box = _extent(depth_map)
+    figure = _figure(7.2, float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9)) + 0.8)
+    ax = figure.subplots()
+    _bar(figure, _draw_spread(ax, spread, top), [ax], "spread between frames (mm)", extend="max")
+    _frame(ax, box)
+    ax.set_xlabel("x (m)")
+    ax.set_ylabel("y (m)")
+    return _png(figure, dpi=100)
+
+
 def height_colours(
     heights: Floats, low: float | None = None, high: float | None = None
 ) -> NDArray[np.uint8]:
@@ -162,9 +177,9 @@ def height_colours(
         return np.full((*heights.shape, 3), 230, np.uint8)
     low = float(np.quantile(known, 0.01)) if low is None else low
     high = float(np.quantile(known, 0.99)) if high is None else high
-    # the palest end of the colour map reads as "nothing there"
-    level = 0.92 * np.clip((heights - low) / max(high - low, 1e-12), 0.0, 1.0)
-    rgba = colormaps[HEIGHTS](np.nan_to_num(level))
+    level = np.clip((heights - low) / max(high - low, 1e-12), 0.0, 1.0)
+    # the ends of this colour map are black and white: no room for shade, or "nothing there"
+    rgba = colormaps[HEIGHTS](0.2 + 0.72 * np.nan_to_num(level))
     return np.rint(255.0 * rgba[..., :3]).astype(np.uint8)
 
 
@@ -220,9 +235,13 @@ def _figure(width: float, height: float) -> Figure:
 
 def _save(figure: Figure, path: str | os.PathLike[str], dpi: int) -> None:
     """Write the figure as PNG, whole or not at all."""
+    durable.write_bytes(path, _png(figure, dpi))
+
+
+def _png(figure: Figure, dpi: int) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi, metadata={"Software": None})
-    durable.write_bytes(path, out.getvalue())
+    return out.getvalue()
 
 
 def _extent(depth_map: DepthMap) -> tuple[float, float, float, float]:
@@ -247,12 +266,6 @@ def _height_range(result: Result) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = np.quantile(known, [0.01, 0.99])
     return float(low), float(high)
-
-
-def _spread_top(both: Spreads) -> float:
-    """Return the end of the spread's colours, mm: most of what the start shows."""
-    top = 1e3 * np.nanmax([both.before.quantile(0.9), both.after.quantile(0.5), 1e-6])
-    return float(top)
 
 
 def _draw_relief(ax: Axes, depth_map: DepthMap, span: tuple[float, float]) -> Any:

@@ -93,7 +93,7 @@ class RunFolder:
 
         clouds = load_clouds(dataset)
         config = yaml.safe_dump(_plain(dataclasses.asdict(options)), sort_keys=False)
-        durable.write_bytes(self.path / "config.yaml", config.encode())
+        durable.write_text(self.path / "config.yaml", config)
         trajectory.write_tum(
             self.path / "poses.txt", np.array(result.stamps), result.T_world_camera, "estimate"
         )
@@ -109,8 +109,7 @@ class RunFolder:
         points, colours = merged_cloud(result, options, clouds)
         write_ply(self.path / "cloud.ply", points, colours)
         map_picture(result, dataset, self.path / "map.png", options=options, clouds=clouds)
-        text = json.dumps(summary(result, options, dataset), indent=1, allow_nan=False)
-        durable.write_bytes(self.path / "result.json", (text + "\n").encode())
+        durable.write_json(self.path / "result.json", summary(result, options, dataset))
         if self.path.resolve().parent.name == LOGS.name:
             link_latest(self.path)
 
@@ -135,7 +134,7 @@ def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             body = io.BytesIO()
-            np.lib.format.write_array(body, np.ascontiguousarray(array), allow_pickle=False)
+            np.lib.format.write_array(body, np.asarray(array, order="C"), allow_pickle=False)
             archive.writestr(entry, body.getvalue(), compresslevel=1)
     return out.getvalue()
 

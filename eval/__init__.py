@@ -1,0 +1,1 @@
+"""Judges runs: metrics, reports, recordings and their review."""

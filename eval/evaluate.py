@@ -1,0 +1,218 @@
+"""Judges a run: against truth where there is one, and by how well its frames agree in any case."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import durable, se3, trajectory
+from depthba.clouds import load_clouds, point_spacing
+from depthba.dataset import Dataset
+from depthba.errors import OptionError, RunError
+from depthba.picture import CELL_SPACINGS
+from depthba.run_folder import Run
+from eval.metrics import Metric, consistency, pose_metrics, start
+from eval.self_consistency import agreement, map_rotation
+
+Floats = NDArray[np.float64]
+
+SAME_STAMP = 1e-6
+"""Stamps that differ by no more than this, s, are one frame."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All figures of one run."""
+
+    run: Run
+    dataset: Dataset
+    metrics: tuple[Metric, ...]
+    """Of the estimate."""
+    start_metrics: tuple[Metric, ...]
+    """Of the start poses, under the same names."""
+    cell: float
+    """Edge of the cells in which frames are compared, m."""
+    shared_cells: int
+    """Cells that two or more frames see, at the estimate."""
+    pairs: int
+    """Overlapping pairs of frames, at the estimate."""
+    nees_dof: int | None
+    """Degrees of freedom behind the consistency figure; None without truth or covariance."""
+    seconds: float
+    """That the judging took."""
+
+
+def evaluate(
+    run: str | os.PathLike[str],
+    dataset: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    cell: float | None = None,
+) -> list[Metric]:
+    """Judge a run and leave metrics.json and report.md in its folder.
+
+    Args:
+        run: the run folder.
+        dataset: the dataset's folder; None: the one that the run remembers.
+        truth: a file of true poses, TUM; None: the dataset's own, if it has any.
+        cell: edge of the cells in which frames are compared, m; None: four point spacings.
+
+    Returns:
+        The metrics of the estimate, then those of the start poses, whose names begin with ``start_``.
+
+    Raises:
+        RunError: the run or its dataset is missing, or they do not belong together.
+        DatasetError: the dataset or the truth is wrong.
+        OptionError: ``cell`` makes no sense.
+
+    """
+    judged = save(run, dataset, truth, cell)
+    return [*judged.metrics, *start(judged.start_metrics)]
+
+
+def save(
+    run: str | os.PathLike[str],
+    dataset: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    cell: float | None = None,
+) -> Evaluation:
+    """Judge a run and leave metrics.json and report.md in its folder; see `evaluate`."""
+    from eval.report import report  # which needs this module's types
+
+    judged = judge(run, dataset, truth, cell)
+    durable.write_json(judged.run.path / "metrics.json", as_json(judged))
+    durable.write_text(judged.run.path / "report.md", report(judged))
+    return judged
+
+
+def judge(
+    run: str | os.PathLike[str],
+    dataset: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    cell: float | None = None,
+) -> Evaluation:
+    """Compute all figures of a run; see `evaluate`. Writes nothing."""
+    began = time.perf_counter()
+    if cell is not None and not (np.isfinite(cell) and cell > 0):
+        raise OptionError(f"cell: {cell} m, expected a length above 0")
+    opened = Run.open(run)
+    data = _open_dataset(opened, dataset)
+    rows = _match(data.stamps, opened.stamps, f"{opened.path / 'poses.txt'}", f"{data.path}")
+    T_est, T_start = opened.T_world_camera, opened.T_world_camera_start
+    T_measured = data.T_world_camera_measured[rows]
+    if T_start is None:
+        T_start = T_measured
+    T_true = _truth(data, rows, opened, truth)
+
+    metrics: list[Metric] = []
+    before: list[Metric] = []
+    dof = None
+    if T_true is not None:
+        metrics += pose_metrics(T_est, T_true)
+        before += pose_metrics(T_start, T_true)
+        if opened.covariance is not None and len(T_est) > 1:
+            judged = consistency(T_est, T_true, opened.covariance)
+            metrics.append(Metric("nees_per_dof", "1", "one", judged.nees_per_dof))
+            dof = judged.dof
+
+    clouds = load_clouds(data, colours=False)
+    points = [clouds[k].points for k in rows]
+    if cell is None:
+        cell = CELL_SPACINGS * point_spacing(data, points)
+    reference = T_measured if T_true is None else T_true
+    agreements = [
+        agreement(
+            points,
+            se3.align_first(T, reference),
+            map_rotation(data, reference),
+            cell,
+            roi=opened.config.get("roi"),
+            T_map_world=opened.depth_map.T_map_world,
+        )
+        for T in (T_start, T_est)
+    ]
+    before += agreements[0].metrics()
+    metrics += agreements[1].metrics()
+    return Evaluation(
+        run=opened,
+        dataset=data,
+        metrics=tuple(metrics),
+        start_metrics=tuple(before),
+        cell=cell,
+        shared_cells=len(agreements[1].spread.shared),
+        pairs=len(agreements[1].pairs),
+        nees_dof=dof,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def as_json(judged: Evaluation) -> dict[str, Any]:
+    """Return what metrics.json holds: name to value, unit and direction; a value that is unknown is null."""
+
+    def figures(metrics: Sequence[Metric]) -> dict[str, Any]:
+        return {
+            m.name: {
+                "value": m.value if np.isfinite(m.value) else None,
+                "unit": m.unit,
+                "better": m.better,
+            }
+            for m in metrics
+        }
+
+    return {
+        "format": "depthba-metrics",
+        "version": 1,
+        "run": judged.run.path.resolve().name,
+        "dataset": judged.dataset.name,
+        "metrics": figures(judged.metrics),
+        "start": figures(judged.start_metrics),
+        "cell": judged.cell,
+        "shared_cells": judged.shared_cells,
+        "pairs": judged.pairs,
+        "nees_dof": judged.nees_dof,
+        "seconds": judged.seconds,
+    }
+
+
+def _open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
+    """Open the dataset of a run, or the one given in its place."""
+    if path is None and not run.dataset_path.is_dir():
+        raise RunError(
+            f"{run.path}: its dataset {run.dataset_path} is not there; say with --dataset where it is"
+        )
+    return Dataset.open(run.dataset_path if path is None else path)
+
+
+def _match(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np.int64]:
+    """Return for each stamp of ``want`` the index of the equal stamp in ``have``."""
+    if not len(have):
+        raise RunError(f"{owner}: holds no frames")
+    order = np.argsort(have)
+    place = np.clip(np.searchsorted(have[order], want), 1, len(have) - 1) if len(have) > 1 else None
+    if place is None:
+        nearest = np.zeros(len(want), np.int64)
+    else:
+        left, right = order[place - 1], order[place]
+        nearest = np.where(np.abs(have[left] - want) <= np.abs(have[right] - want), left, right)
+    apart = np.abs(have[nearest] - want)
+    if np.any(apart > SAME_STAMP):
+        worst = want[np.argmax(apart)]
+        raise RunError(f"{wanted_by}: stamp {worst:.6f} s, expected one of the frames in {owner}")
+    return np.asarray(nearest, dtype=np.int64)
+
+
+def _truth(
+    data: Dataset, rows: NDArray[np.int64], run: Run, path: str | os.PathLike[str] | None
+) -> Floats | None:
+    """Return the true poses of the run's frames, (N, 4, 4), or None."""
+    if path is None:
+        true = data.T_world_camera_true
+        return None if true is None else true[rows]
+    stamps, T = trajectory.read_tum(Path(path))
+    return T[_match(stamps, run.stamps, f"{run.path / 'poses.txt'}", str(path))]

@@ -1,0 +1,262 @@
+"""Records a registration for the Rerun viewer: poses, map, clouds and curves, step by step.
+
+Everything is in the world frame, metres. What stands where:
+
+- ``cam/<i>``: pose of frame i over the iterations; its points and view frustum below it;
+- ``before/<i>``: the same frame at its start pose;
+- ``map/surface``, ``map/picture``: the depth map over the iterations, as a mesh and from above;
+- ``spread/before``, ``spread/after``: how far the frames disagree, from above;
+- ``centres/start``, ``centres/true``: where the cameras stood at the start, and in truth;
+- ``curves/...``, ``residual/<i>``: scalars over the iterations;
+- ``figures``: the metrics for people; the properties of the recording hold them for programs.
+
+Iteration 0 is the start, iteration k + 1 what step k left. Frames count from 0 as in the dataset.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from depthba import se3
+from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, transform
+from depthba.dataset import Dataset
+from depthba.depth_map import DepthMap
+from depthba.options import Options
+from depthba.picture import spread_png, spreads
+from depthba.result import Iteration, Result
+from depthba.run_folder import versions
+from depthba.spread import MAD_TO_SIGMA
+from eval.metrics import Metric, pose_errors
+from eval.recorded_map import RecordedMap, residuals
+from eval.recording_layout import blueprint, frame_colours
+from eval.report import figures_page
+
+Floats = NDArray[np.float64]
+
+APPLICATION = "depthba"
+NAME = "run.rrd"
+CLOUD_POINTS = 160_000
+"""Points of all frames together; each is recorded twice at 12 bytes, before and after."""
+RESIDUAL_POINTS = 2_000
+"""Points of a frame that its residual is taken from."""
+MILLI = 1e3
+"""Curves are in millimetres and milliradians: their axes can be read."""
+
+CURVES: Mapping[str, tuple[str, tuple[int, int, int]]] = {
+    "curves/cost/cost": ("cost", (230, 180, 60)),
+    "curves/sigma/sigma": ("sigma (mm)", (90, 190, 250)),
+    "curves/step/translation": ("largest translation (mm)", (90, 190, 250)),
+    "curves/step/rotation": ("largest rotation (mrad)", (250, 130, 90)),
+    "curves/inliers/inliers": ("inliers (%)", (120, 220, 120)),
+    "curves/spacing/spacing": ("map spacing (mm)", (200, 200, 200)),
+    "curves/error/translation": ("translation, mean absolute (mm)", (90, 190, 250)),
+    "curves/error/rotation": ("rotation, mean absolute (mrad)", (250, 130, 90)),
+}
+
+
+class Recorder:
+    """Writes a recording while a registration runs; give it to `depthba.register` as the callback.
+
+    The file stands under its name once `finish` was called, and under a hidden one before.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        dataset: Dataset,
+        options: Options | None = None,
+        clouds: Sequence[FrameCloud] | None = None,
+    ) -> None:
+        """Begin a recording.
+
+        Args:
+            path: the file, such as run.rrd in the run's folder, which exists.
+            dataset: what is registered.
+            options: how; for the properties and the region of interest.
+            clouds: the points of all frames, where the caller has them already.
+
+        """
+        self.path = Path(path)
+        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._dataset = dataset
+        self._options = options or Options()
+        self._clouds = load_clouds(dataset, colours=False) if clouds is None else tuple(clouds)
+        self._samples: list[Floats] = []
+        self._true = dataset.T_world_camera_true
+        self._colours = frame_colours(len(dataset))
+        self._map = RecordedMap()
+        self._stream = rr.RecordingStream(APPLICATION)
+        self._stream.set_log_tick_enabled(False)
+        self._stream.set_log_time_enabled(False)
+        self._stream.save(self._part)
+        self._stream.send_recording_name(self.path.resolve().parent.name)
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Record the state after a step."""
+        self._begin(self._dataset.T_world_camera_measured, iteration.depth_map)
+        self._time(iteration.index + 1, iteration.seconds)
+        self._state(iteration.T_world_camera, iteration.depth_map)
+        self._scalars(
+            {
+                "curves/cost/cost": _log10(iteration.cost),
+                "curves/sigma/sigma": MILLI * iteration.sigma,
+                "curves/step/translation": _log10(MILLI * iteration.step_t),
+                "curves/step/rotation": _log10(MILLI * iteration.step_r),
+                "curves/inliers/inliers": 100.0 * iteration.inliers,
+                "curves/spacing/spacing": MILLI * iteration.depth_map.spacing,
+            }
+        )
+
+    def finish(self, result: Result, metrics: Sequence[Metric] | None = None) -> None:
+        """Record the result and put the file into its place.
+
+        Args:
+            result: what the registration returned.
+            metrics: what `eval.evaluate.evaluate` returned; None: the page of figures does without.
+
+        """
+        metrics = metrics or ()
+        self._begin(result.T_world_camera_start, result.depth_map_start)
+        last = result.history[-1].seconds if result.history else 0.0
+        self._time(len(result.history) + 1, max(last, result.seconds.get("total", 0.0)))
+        self._state(result.T_world_camera, result.depth_map, final=True)
+        self._time(0, 0.0)
+        self._state(result.T_world_camera_start, result.depth_map_start)
+        self._before(result)
+        page = figures_page(self._dataset.name, result, metrics)
+        rec = self._stream
+        rec.log("figures", rr.TextDocument(page, media_type="text/markdown"), static=True)
+        rec.send_property("run", rr.AnyValues(**_facts(self._dataset, self._options, result)))
+        if metrics:
+            values = {m.name: m.value for m in metrics if np.isfinite(m.value)}
+            rec.send_property("metrics", rr.AnyValues(**values))
+        rec.send_blueprint(blueprint(result.depth_map, truth=self._true is not None))
+        rec.flush()
+        rec.disconnect()
+        self._part.replace(self.path)
+
+    def discard(self) -> None:
+        """End without a recording and leave no file."""
+        self._stream.disconnect()
+        self._part.unlink(missing_ok=True)
+
+    def _begin(self, T_world_camera: Floats, depth_map: DepthMap) -> None:
+        """Record, once, what stays as it is: the frames' points and the names of the curves."""
+        if self._samples:
+            return
+        rec, share = self._stream, CLOUD_POINTS // max(len(self._clouds), 1)
+        rng = np.random.default_rng(0)
+        spacing = point_spacing(self._dataset, [c.points for c in self._clouds])
+        for i, (cloud, T) in enumerate(zip(self._clouds, T_world_camera, strict=True)):
+            p = cloud.points
+            p = p[inside(transform(depth_map.T_map_world @ T, p), self._options.roi)]
+            radius = 0.55 * spacing * np.sqrt(max(1.0, len(p) / share))
+            p = rng.permutation(p)[:share]
+            self._samples.append(p)
+            shown = rr.Points3D(p.astype(np.float32), colors=self._colours[i], radii=radius)
+            rec.log(f"cam/{i}/points", shown, static=True)
+            rec.log(f"before/{i}/points", shown, static=True)
+            self._frustum(f"cam/{i}", i, p)
+            self._frustum(f"before/{i}", i, p)
+        names = {**CURVES}
+        for i, colour in enumerate(self._colours):
+            names[f"residual/{i}"] = (f"frame {i}", tuple(int(c) for c in colour))
+        for path, (name, rgb) in names.items():
+            rec.log(path, rr.SeriesLines(names=name, colors=rgb), static=True)
+        if self._true is not None:
+            p = se3.align_first(self._true, T_world_camera)[:, :3, 3]
+            self._centres("centres/true", p, (255, 255, 255), "true centre")
+
+    def _frustum(self, path: str, i: int, points: Floats) -> None:
+        """Record a camera's view as a small frustum."""
+        camera = self._dataset.sensor.camera
+        if camera is None:
+            return
+        size = 0.12 * float(np.median(points[:, 2])) if len(points) else 0.1
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=size,
+            color=self._colours[i],
+        )
+        self._stream.log(f"{path}/image", pinhole, static=True)
+
+    def _state(self, T_world_camera: Floats, depth_map: DepthMap, *, final: bool = False) -> None:
+        """Record poses, map, residuals and, where truth is known, errors."""
+        for i, T in enumerate(T_world_camera):
+            self._stream.log(f"cam/{i}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        self._map.log(self._stream, depth_map, final=final)
+        scalars = {}
+        for i, (T, p) in enumerate(zip(T_world_camera, self._samples, strict=True)):
+            r = residuals(depth_map, T, p[:RESIDUAL_POINTS])
+            r = r[np.isfinite(r)]
+            if len(r):
+                scalars[f"residual/{i}"] = MILLI * MAD_TO_SIGMA * float(np.median(np.abs(r)))
+        if self._true is not None and len(T_world_camera) > 1:
+            aligned = se3.align_first(T_world_camera, self._true)
+            e = np.abs(pose_errors(aligned, self._true)[1:])
+            scalars["curves/error/translation"] = MILLI * float(e[:, :3].mean())
+            scalars["curves/error/rotation"] = MILLI * float(e[:, 3:].mean())
+        self._scalars(scalars)
+
+    def _before(self, result: Result) -> None:
+        """Record the start poses, and how far the frames disagree at them and at the result."""
+        rec = self._stream
+        for i, T in enumerate(result.T_world_camera_start):
+            shown = rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+            rec.log(f"before/{i}", shown, static=True)
+        centres = result.T_world_camera_start[:, :3, 3]
+        self._centres("centres/start", centres, (150, 150, 150), "start centre")
+        both = spreads(result, self._dataset, self._clouds, self._options.roi)
+        for name, spread in (("before", both.before), ("after", both.after)):
+            picture = spread_png(spread, result.depth_map, both.top)
+            shown = rr.EncodedImage(contents=picture, media_type="image/png")
+            rec.log(f"spread/{name}", shown, static=True)
+
+    def _centres(
+        self, path: str, centres: Floats, colour: tuple[int, int, int], label: str
+    ) -> None:
+        shown = rr.Points3D(
+            centres, colors=colour, radii=-4.0, labels=[label] * len(centres), show_labels=False
+        )
+        self._stream.log(path, shown, static=True)
+
+    def _time(self, iteration: int, seconds: float) -> None:
+        self._stream.set_time("iteration", sequence=iteration)
+        self._stream.set_time("elapsed", duration=seconds)
+
+    def _scalars(self, values: Mapping[str, float]) -> None:
+        for path, value in values.items():
+            if np.isfinite(value):
+                self._stream.log(path, rr.Scalars(value))
+
+
+def _facts(dataset: Dataset, options: Options, result: Result) -> dict[str, Any]:
+    """Return what programs ask many recordings for."""
+    facts: dict[str, Any] = {
+        "dataset": dataset.name,
+        "preset": options.preset,
+        "init": options.init,
+        "status": result.status,
+        "frames": len(result.frame_ids),
+        "iterations": len(result.history),
+        "seconds": float(sum(result.seconds.values())),
+        "sigma": result.sigma,
+        "map_spacing": result.depth_map.spacing,
+        **{f"version_{k}": v for k, v in versions().items()},
+    }
+    if dataset.seed is not None:
+        facts["seed"] = dataset.seed
+    return facts
+
+
+def _log10(value: float) -> float:
+    return float(np.log10(value)) if value > 0 else float("nan")

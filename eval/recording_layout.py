@@ -1,0 +1,110 @@
+"""How a recording opens in the viewer: which views, where, and seen from where."""
+
+from __future__ import annotations
+
+import colorsys
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from depthba.depth_map import DepthMap
+
+Floats = NDArray[np.float64]
+
+BACKGROUND = (24, 26, 30)
+
+
+def frame_colours(count: int) -> NDArray[np.uint8]:
+    """Return (count, 3) colours, of which consecutive ones are far apart."""
+    golden = 0.381966
+    return np.array(
+        [
+            [
+                round(255 * c)
+                for c in colorsys.hsv_to_rgb((i * golden) % 1.0, 0.62, (1.0, 0.85)[i % 2])
+            ]
+            for i in range(count)
+        ],
+        dtype=np.uint8,
+    ).reshape(count, 3)
+
+
+def blueprint(depth_map: DepthMap, *, truth: bool) -> rrb.Blueprint:
+    """Arrange the views: before on the left, after in the middle, figures, map and curves on the right."""
+    before = rrb.Vertical(
+        _scene("BEFORE: frames at their start poses", ["/before/**", "/centres/start"], depth_map),
+        _above("BEFORE: how far the frames disagree", "/spread/before"),
+        row_shares=[3, 2],
+    )
+    after = rrb.Vertical(
+        _scene("AFTER: frames as depthba places them", ["/cam/**", "/centres/**"], depth_map),
+        _above("AFTER: how far the frames disagree", "/spread/after"),
+        row_shares=[3, 2],
+    )
+    curves = [
+        _curves("Residual of each frame (mm)", "/residual"),
+        _curves("Robust sigma of the residuals (mm)", "/curves/sigma"),
+        _curves("Step (log10 of mm and mrad)", "/curves/step"),
+        _curves("Cost (log10)", "/curves/cost"),
+        _curves("Inliers (%)", "/curves/inliers"),
+        _curves("Map spacing (mm)", "/curves/spacing"),
+    ]
+    if truth:
+        curves.insert(0, _curves("Error against truth (mm and mrad)", "/curves/error"))
+    told = rrb.Vertical(
+        rrb.TextDocumentView(origin="/figures", name="Figures"),
+        rrb.Tabs(
+            _scene("Map", ["/map/surface"], depth_map),
+            _above("Map from above", "/map/picture"),
+        ),
+        rrb.Tabs(*curves, active_tab=0),
+        row_shares=[4, 3, 3],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(before, after, told, column_shares=[5, 5, 5]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="iteration"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _scene(name: str, contents: list[str], depth_map: DepthMap) -> rrb.Spatial3DView:
+    """Return a view of the scene from above and in front, so that all of it is seen."""
+    vertices = depth_map.vertices().reshape(-1, 3)
+    vertices = vertices[np.isfinite(vertices).all(axis=1)]
+    if not len(vertices):
+        return rrb.Spatial3DView(origin="/", contents=contents, name=name)
+    # the map frame's axes in the world
+    along, up = depth_map.T_map_world[1, :3], depth_map.T_map_world[2, :3]
+    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    return rrb.Spatial3DView(
+        origin="/",
+        contents=contents,
+        name=name,
+        background=rrb.Background(color=BACKGROUND, kind=rrb.BackgroundKind.SolidColor),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=centre + size * (0.75 * up - 0.55 * along),
+            look_target=centre,
+            eye_up=up,
+        ),
+    )
+
+
+def _above(name: str, origin: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin=origin, name=name, contents=["$origin/**"])
+
+
+def _curves(name: str, origin: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        plot_legend=rrb.PlotLegend(visible=origin != "/residual"),
+        axis_x=rrb.TimeAxis(link=rr.blueprint.components.LinkAxis.Independent),
+    )

@@ -1,0 +1,240 @@
+"""A page about one run, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from depthba.result import Result
+from eval.metrics import Metric, split
+
+if TYPE_CHECKING:
+    from eval.evaluate import Evaluation
+
+NAMES = {
+    "translation_mae": "Translation, mean absolute error",
+    "translation_rmse": "Translation, root mean square",
+    "translation_max": "Translation, largest",
+    "rotation_mae": "Rotation, mean absolute error",
+    "rotation_rmse": "Rotation, root mean square",
+    "rotation_max": "Rotation, largest",
+    "ate_rmse": "Trajectory after best alignment (ATE)",
+    "rpe_translation_rmse": "Motion between frames, translation (RPE)",
+    "rpe_rotation_rmse": "Motion between frames, rotation (RPE)",
+    "nees_per_dof": "Error over stated covariance (NEES per degree of freedom)",
+    "spread_median": "Disagreement of frames, median cell",
+    "spread_p90": "Disagreement of frames, 90 % of cells",
+    "point_to_plane_median": "Point to plane between frames, median pair",
+    "point_to_plane_worst_pair": "Point to plane between frames, worst pair",
+}
+"""The metrics that a table for people shows, in its order; the others are per axis."""
+
+VERDICTS = {
+    "converged": "Converged",
+    "not_converged": "Not to be trusted: not converged",
+    "weak": "Not to be trusted everywhere: the data leave something open",
+    "no_better": "Not to be trusted: nothing better than the start poses was found",
+}
+
+
+def report(judged: Evaluation) -> str:
+    """Return report.md: verdict, figures before and after, the picture, weak directions, frames, how it was run."""
+    run = judged.run.result
+    parts = [
+        f"# {judged.run.name}",
+        f"**{VERDICTS.get(run['status'], run['status'])}.** {run['reason']}",
+        "![The map and the disagreement of frames, before and after](map.png)",
+        "## Before and after",
+        figures_table(judged.metrics, judged.start_metrics),
+        _explanation(judged),
+        *_axes(judged),
+        *_weak(run["weak"]),
+        *_held(run["frames"]),
+        "## Frames",
+        _frames(run["frames"]),
+        "## How it was run",
+        _facts(judged),
+        "Files: [result.json](result.json), [poses.txt](poses.txt), [metrics.json](metrics.json), "
+        "map.npz, covariance.npz, cloud.ply. `depthba review` opens the recording.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def figures_page(name: str, result: Result, metrics: Sequence[Metric]) -> str:
+    """Return a short page in Markdown for beside the pictures.
+
+    Args:
+        name: of the dataset.
+        result: the run.
+        metrics: those of the estimate and of the start poses, as `eval.evaluate.evaluate` returns them.
+
+    """
+    parts = [
+        f"# {name}",
+        f"**{VERDICTS.get(result.status, result.status)}.** {result.reason}",
+    ]
+    if metrics:
+        parts.append(figures_table(*split(metrics)))
+    else:
+        parts.append("Not judged yet: `depthba evaluate` adds the figures.")
+    for w in result.weak:
+        parts.append(f"- frame {w.frame} is open along {w.name}: held by its measured pose")
+    parts += [f"- frame {f.frame} is held at its start pose: {f.held}" for f in result.frames if f.held]
+    seconds = result.seconds.get("total", sum(result.seconds.values()))
+    parts.append(
+        f"{len(result.frame_ids)} frames, {len(result.history)} iterations, {three_digits(seconds)} s, "
+        f"map spacing {_mm(result.depth_map.spacing)}"
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def figures_table(metrics: Sequence[Metric], start_metrics: Sequence[Metric]) -> str:
+    """Return a Markdown table of the figures that count, start beside estimate."""
+    before = {m.name: m for m in start_metrics}
+    now = {m.name: m for m in metrics}
+    rows = []
+    for name, words in NAMES.items():
+        if name not in now:
+            continue
+        first = show(before[name]) if name in before else ""
+        rows.append([words, first, f"**{show(now[name])}**", gain(before.get(name), now[name])])
+    return _table(["", "Start poses", "depthba", "Better by"], rows)
+
+
+def show(metric: Metric) -> str:
+    """Return a metric's value for people, three digits: millimetres, milliradians or a bare number."""
+    unit = {"m": " mm", "rad": " mrad", "1": ""}[metric.unit]
+    value = metric.value if metric.unit == "1" else 1e3 * metric.value
+    return "unknown" if not np.isfinite(value) else f"{three_digits(value)}{unit}"
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three digits and no exponent; the far end of small ones is cut."""
+    digits = 2 - int(np.floor(np.log10(abs(value)))) if value else 2
+    return f"{value:.{min(max(digits, 0), 5)}f}"
+
+
+def gain(before: Metric | None, now: Metric) -> str:
+    """Return by what factor an error fell; empty where that means nothing."""
+    if before is None or not (before.value > 0 and now.value > 0):
+        return ""
+    factor = before.value / now.value
+    return f"{three_digits(factor)} ×" if factor < 1000 else f"{factor:.0f} ×"
+
+
+def _explanation(judged: Evaluation) -> str:
+    text = (
+        f"Frames are compared in cells of {three_digits(1e3 * judged.cell)} mm; two or more frames "
+        f"see {judged.shared_cells} of them, and {judged.pairs} pairs of frames overlap."
+    )
+    if any(m.name == "translation_mae" for m in judged.metrics):
+        text = f"Errors are against the truth, frame 0 put onto it. {text}"
+    else:
+        text = f"There is no truth: the figures say how well the frames agree. {text}"
+    if judged.nees_dof is not None:
+        text += (
+            f" NEES is over {judged.nees_dof} degrees of freedom: 1 is an honest covariance, "
+            "above it is too sure of itself."
+        )
+    return text
+
+
+def _axes(judged: Evaluation) -> list[str]:
+    """Return the mean absolute errors per axis, where there is truth."""
+    now = {m.name: m for m in judged.metrics}
+    if "translation_mae_x" not in now:
+        return []
+    before = {m.name: m for m in judged.start_metrics}
+    rows = []
+    for part in ("translation", "rotation"):
+        for axis in "xyz":
+            name = f"{part}_mae_{axis}"
+            rows.append([f"{part} {axis}", show(before[name]), show(now[name])])
+    return ["Mean absolute error per axis of the world:", _table(["", "Start", "depthba"], rows)]
+
+
+def _weak(weak: Sequence[dict[str, Any]]) -> list[str]:
+    if not weak:
+        return []
+    rows = [
+        [
+            str(w["frame"]),
+            w["name"],
+            _mm(w["sigma"]),
+            _mm(w["prior_sigma"]),
+        ]
+        for w in weak
+    ]
+    return [
+        "## Weak directions",
+        "The data do not fix these motions, so the measured poses hold them.",
+        _table(["Frame", "Direction (map axes)", "Data alone leave", "Measured pose gives"], rows),
+    ]
+
+
+def _held(frames: Sequence[dict[str, Any]]) -> list[str]:
+    held = [f for f in frames if f["held"]]
+    if not held:
+        return []
+    lines = [f"- frame {f['frame']}: {f['held']}" for f in held]
+    return ["## Frames held at their start poses", "\n".join(lines)]
+
+
+def _frames(frames: Sequence[dict[str, Any]]) -> str:
+    rows = [
+        [
+            str(f["frame"]),
+            str(f["points"]),
+            _percent(f["overlap"]),
+            _percent(f["inliers"]),
+            _mm(f["move_t"]),
+            _mrad(f["move_r"]),
+            "held" if f["held"] else "",
+        ]
+        for f in frames
+    ]
+    head = ["Frame", "Points", "Overlap", "Inliers", "Moved", "Turned", ""]
+    return _table(head, rows)
+
+
+def _facts(judged: Evaluation) -> str:
+    run, options = judged.run.result, judged.run.config
+    stages = ", ".join(f"{k} {three_digits(v)} s" for k, v in run["seconds"].items())
+    noise = f"{_mm(run['sigma'])}; inflation of the covariance by correlation {run['inflation']:.3g}"
+    rows = [
+        ["Dataset", f"{judged.dataset.name}, {len(judged.run.stamps)} frames"],
+        ["Preset", str(options.get("preset"))],
+        [
+            "Map",
+            f"{run['map']['nx']} × {run['map']['ny']} nodes, {_mm(run['map']['spacing'])} apart",
+        ],
+        ["Iterations", str(run["iterations"])],
+        ["Seconds", stages],
+        ["Residuals, robust standard deviation", noise],
+        ["Versions", ", ".join(f"{k} {v}" for k, v in run["versions"].items())],
+    ]
+    if judged.dataset.seed is not None:
+        rows.insert(1, ["Seed", str(judged.dataset.seed)])
+    if options.get("roi"):
+        rows.insert(3, ["Region of interest (m)", " ".join(f"{v:g}" for v in options["roi"])])
+    return _table(["", ""], rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; the first column to the left, the others to the right."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "/") for cell in r) + " |" for r in lines)
+
+
+def _mm(metres: float | None) -> str:
+    return "unknown" if metres is None else f"{three_digits(1e3 * metres)} mm"
+
+
+def _mrad(radians: float | None) -> str:
+    return "unknown" if radians is None else f"{three_digits(1e3 * radians)} mrad"
+
+
+def _percent(share: float | None) -> str:
+    return "unknown" if share is None else f"{100 * share:.0f} %"
