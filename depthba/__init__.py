@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from depthba.dataset import Dataset, Frame
     from depthba.depth_map import DepthMap
     from depthba.errors import DatasetError, DepthbaError, MissingPackage, OptionError, RunError
-    from depthba.optimiser import register
+    from depthba.optimiser.register import register
     from depthba.options import Options
     from depthba.result import Iteration, Result
 
@@ -49,7 +49,7 @@ _HOMES = {
     "Options": "depthba.options",
     "Result": "depthba.result",
     "RunError": "depthba.errors",
-    "register": "depthba.optimiser",
+    "register": "depthba.optimiser.register",
 }
 
 

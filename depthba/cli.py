@@ -11,12 +11,9 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from depthba.errors import DepthbaError, MissingPackage
 from depthba.verbs import DONE, INTERRUPTED, KNOWN_ERROR, WRONG_USAGE
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 
 @dataclass(frozen=True)
@@ -101,12 +98,21 @@ def _main(words: list[str]) -> int:
         choices = ", ".join(VERBS)
         print(f"depthba: no verb {name!r}; choose from: {choices}", file=sys.stderr)
         return WRONG_USAGE
-    module = _load(name)
-    from depthba.verbs.arguments import parse
+    verb = VERBS[name]
+    if missing := _missing(verb):
+        raise MissingPackage(_install_line(name, missing, verb.extra))
+    try:
+        module = importlib.import_module(verb.module)
+        arguments_type: type[object] = module.Arguments
+        run: Callable[[object], int] = module.run
+        from depthba.verbs.arguments import parse
 
-    arguments = parse(module.Arguments, rest, prog=f"depthba {name}")
-    run: Callable[[object], int] = module.run
-    return run(arguments)
+        return run(parse(arguments_type, rest, prog=f"depthba {name}"))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("depthba", "sim", "rig", "eval", ""):
+            raise
+        raise MissingPackage(_install_line(name, package, verb.extra)) from error
 
 
 def _overview() -> str:
@@ -139,22 +145,6 @@ def _missing(verb: Verb) -> str:
     return ", ".join(name for name in verb.needs if importlib.util.find_spec(name) is None)
 
 
-def _load(name: str) -> ModuleType:
-    from depthba.errors import MissingPackage
-
-    verb = VERBS[name]
-    missing = _missing(verb)
-    if missing:
-        raise MissingPackage(_install_line(name, missing, verb.extra))
-    try:
-        return importlib.import_module(verb.module)
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package in ("depthba", "sim", "rig", "eval", ""):
-            raise
-        raise MissingPackage(_install_line(name, package, verb.extra)) from error
-
-
 def _install_line(verb: str, packages: str, extra: str) -> str:
     what = f"depthba[{extra}]" if extra else "depthba"
     return f"{verb} needs {packages}, which is not installed: pip install '{what}'"
@@ -162,8 +152,6 @@ def _install_line(verb: str, packages: str, extra: str) -> str:
 
 def _known(error: Exception) -> str | None:
     """Return the line for an error that is no fault of the program, else None."""
-    from depthba.errors import DepthbaError
-
     if isinstance(error, DepthbaError):
         return str(error)
     if isinstance(error, OSError) and error.errno is not None:

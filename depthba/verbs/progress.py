@@ -51,13 +51,16 @@ class RegistrationProgress:
 
     def __call__(self, iteration: Iteration) -> None:
         """Show one iteration."""
-        state = _state(iteration)
-        if self._bar is None:
-            self._console.print(f"{self._name}: {state}", markup=False)
-            return
         # how many iterations a level takes is not known: the robust phase counts as its second half
         done = iteration.level + (0.5 if iteration.phase == "robust" else 0.0)
-        self._bar.update(self._task, total=iteration.levels, completed=done, state=state)
+        self.say(_state(iteration), done / iteration.levels)
+
+    def say(self, state: str, share: float = 1.0) -> None:
+        """Show what is being done, and which share of everything is."""
+        if self._bar is None:
+            self._console.print(f"{self._name}: {state}", markup=False)
+        else:
+            self._bar.update(self._task, total=1.0, completed=share, state=state)
 
 
 def _state(iteration: Iteration) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +50,9 @@ class Outcome:
     recording: Path | None
     """None: no recording was made."""
     seconds: float
-    """Of the registration alone, without reading the dataset's list and writing the run."""
+    """Of the registration alone, without progress, recording and writing."""
+    metrics: Mapping[str, float]
+    """Value by name, as ``eval`` found them; empty where it was not asked."""
 
 
 def run(arguments: Arguments) -> int:
@@ -69,7 +71,11 @@ def run(arguments: Arguments) -> int:
 
 
 def register_into(
-    dataset: Dataset, options: Options, out: Path | None = None, overwrite: bool = False
+    dataset: Dataset,
+    options: Options,
+    out: Path | None = None,
+    overwrite: bool = False,
+    evaluate: bool = False,
 ) -> Outcome:
     """Register a dataset into a run folder, with progress on stderr and a recording.
 
@@ -78,6 +84,7 @@ def register_into(
         options: how.
         out: the run folder; None takes a new one in logs/.
         overwrite: whether the folder may hold an earlier run.
+        evaluate: judge the run too, so that the recording shows the figures.
 
     Raises:
         DepthbaError: the dataset, the options or the folder do not do. A folder that was
@@ -88,17 +95,28 @@ def register_into(
     from depthba.verbs.progress import RegistrationProgress
 
     path = default_path(dataset.name) if out is None else out
-    with _claimed(path, overwrite):
+    with removed_on_failure(path, overwrite):
         folder = RunFolder.create(path, overwrite=overwrite)
-        recorder = _recorder(path / "run.rrd", dataset, options)
-        with RegistrationProgress(dataset.name) as progress:
+        with (
+            _recorder(path / "run.rrd", dataset, options) as recorder,
+            RegistrationProgress(dataset.name) as progress,
+        ):
+            callback = _Callback(progress, recorder)
             begin = time.perf_counter()
-            result = depthba.register(dataset, options, callback=_both(progress, recorder))
-            seconds = time.perf_counter() - begin
-        folder.write(result, options, dataset)
-        if recorder is not None:
-            recorder.finish(result)
-    return Outcome(result, path, None if recorder is None else path / "run.rrd", seconds)
+            result = depthba.register(dataset, options, callback=callback)
+            seconds = time.perf_counter() - begin - callback.seconds
+            progress.say("writing the run")
+            folder.write(result, options, dataset)
+            metrics = importlib.import_module("eval.evaluate").evaluate(path) if evaluate else []
+            if recorder is not None:
+                recorder.finish(result, metrics)
+    return Outcome(
+        result,
+        path,
+        recording=None if recorder is None else path / "run.rrd",
+        seconds=seconds,
+        metrics={metric.name: metric.value for metric in metrics},
+    )
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -176,8 +194,13 @@ def _first(title: str, items: list[str], most: int) -> list[str]:
 
 
 @contextmanager
-def _claimed(path: Path, overwrite: bool) -> Iterator[None]:
-    """On any failure, interrupts too, remove what was begun, so that nothing half-written stays."""
+def removed_on_failure(path: Path, overwrite: bool) -> Iterator[None]:
+    """On any failure, interrupts too, remove what was begun in a folder.
+
+    Args:
+        path: the folder; where it holds something already, that is left alone.
+        overwrite: whether the folder may hold an earlier run; that then counts as spoilt.
+    """
     existed = path.exists()
     taken = path.is_dir() and any(path.iterdir())
     try:
@@ -195,24 +218,31 @@ def _claimed(path: Path, overwrite: bool) -> Iterator[None]:
         raise
 
 
-def _recorder(path: Path, dataset: Dataset, options: Options) -> Any:
-    """Return a recorder from the package above, which may be missing: then None, and a note."""
+@contextmanager
+def _recorder(path: Path, dataset: Dataset, options: Options) -> Iterator[Any]:
+    """Give a recorder from the package above; where that is missing, None and a note."""
     try:
-        recording = importlib.import_module("eval.recording")
-        return recording.Recorder(path, dataset, options)
+        recorder = importlib.import_module("eval.recording").Recorder(path, dataset, options)
     except ImportError as error:
         note(f"note: no recording is made ({error}): pip install 'depthba[eval]'")
-        return None
+        yield None
+        return
+    try:
+        yield recorder
+    except BaseException:
+        recorder.discard()
+        raise
 
 
-def _both(
-    progress: Callable[[Iteration], None], recorder: Callable[[Iteration], None] | None
-) -> Callable[[Iteration], None]:
-    if recorder is None:
-        return progress
+class _Callback:
+    """Hands every iteration on, and counts the time that this takes."""
 
-    def callback(iteration: Iteration) -> None:
-        progress(iteration)
-        recorder(iteration)
+    def __init__(self, *listeners: Callable[[Iteration], None] | None) -> None:
+        self._listeners = [listener for listener in listeners if listener is not None]
+        self.seconds = 0.0
 
-    return callback
+    def __call__(self, iteration: Iteration) -> None:
+        begin = time.perf_counter()
+        for listener in self._listeners:
+            listener(iteration)
+        self.seconds += time.perf_counter() - begin
