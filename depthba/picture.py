@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 CELL_SPACINGS = 4.0
 """Cells of the spread are this many point spacings wide: enough points for a mean, small enough for slopes."""
-EMPTY = "#e9e9ec"
+EMPTY, DARK = "#e9e9ec", "#121212"
 HEIGHTS, SPREADS = "gist_earth", "inferno_r"
 BEFORE, AFTER = "Before: start poses", "After: depthba"
 
@@ -155,15 +155,21 @@ def before_after(
 
 
 def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
-    """Return the spread alone, from above with axes and colours up to ``top`` mm, as PNG."""
+    """Return the spread alone as PNG, from above, with colours up to ``top`` mm, for a dark ground."""
+    from matplotlib import style
+
     box = _extent(depth_map)
-    figure = _figure(7.2, float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9)) + 0.8)
-    ax = figure.subplots()
-    _bar(figure, _draw_spread(ax, spread, top), [ax], "spread between frames (mm)", extend="max")
-    _frame(ax, box)
-    ax.set_xlabel("x (m)")
-    ax.set_ylabel("y (m)")
-    return _png(figure, dpi=100)
+    height = float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9.0))
+    with style.context("dark_background"):
+        figure = _figure(7.2, height + 0.6, ground=DARK)
+        ax = figure.subplots()
+        image = _draw_spread(ax, spread, top)
+        _bar(figure, image, [ax], "spread between frames (mm)", extend="max")
+        _frame(ax, box)
+        ax.set_facecolor(DARK)
+        ax.set_xlabel("x (m)")
+        ax.set_ylabel("y (m)")
+        return _png(figure, dpi=100)
 
 
 def height_colours(
@@ -223,12 +229,12 @@ def millimetres(metres: float) -> str:
     return f"{mm:.{min(max(digits, 0), 5)}f} mm"
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float, ground: str = "white") -> Figure:
     """Make a figure that needs no screen and touches none of pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor=ground)
     FigureCanvasAgg(figure)
     return figure
 

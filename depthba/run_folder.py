@@ -110,17 +110,23 @@ class RunFolder:
         write_ply(self.path / "cloud.ply", points, colours)
         map_picture(result, dataset, self.path / "map.png", options=options, clouds=clouds)
         durable.write_json(self.path / "result.json", summary(result, options, dataset))
-        if self.path.resolve().parent.name == LOGS.name:
-            link_latest(self.path)
+        link_latest(self.path)
 
 
 def link_latest(run: Path) -> None:
-    """Point ``latest`` beside the folder ``run`` at it; where links are not to be had, leave it."""
-    link, temporary = run.parent / LATEST, run.parent / f".{LATEST}.{os.getpid()}"
+    """Point ``logs/latest`` at ``run`` if it lies in a folder logs, at any depth; else do nothing.
+
+    Where links are not to be had, there is none.
+    """
+    run = run.resolve()
+    logs = next((p for p in run.parents if p.name == LOGS.name), None)
+    if logs is None:
+        return
+    temporary = logs / f".{LATEST}.{os.getpid()}"
     try:
         temporary.unlink(missing_ok=True)
-        temporary.symlink_to(run.name, target_is_directory=True)
-        temporary.replace(link)
+        temporary.symlink_to(run.relative_to(logs), target_is_directory=True)
+        temporary.replace(logs / LATEST)
     except OSError:  # a file system without links, or a folder of that name: a convenience less
         temporary.unlink(missing_ok=True)
 

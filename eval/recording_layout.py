@@ -56,7 +56,7 @@ def blueprint(depth_map: DepthMap, *, truth: bool) -> rrb.Blueprint:
     told = rrb.Vertical(
         rrb.TextDocumentView(origin="/figures", name="Figures"),
         rrb.Tabs(
-            _scene("Map", ["/map/surface"], depth_map),
+            _scene("Map", ["/map/surface"], depth_map, away=0.65),
             _above("Map from above", "/map/picture"),
         ),
         rrb.Tabs(*curves, active_tab=0),
@@ -66,13 +66,17 @@ def blueprint(depth_map: DepthMap, *, truth: bool) -> rrb.Blueprint:
         rrb.Horizontal(before, after, told, column_shares=[5, 5, 5]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="iteration"),
+        rrb.TimePanel(
+            state="collapsed", timeline="iteration", play_state="following"
+        ),
         auto_views=False,
         auto_layout=False,
     )
 
 
-def _scene(name: str, contents: list[str], depth_map: DepthMap) -> rrb.Spatial3DView:
+def _scene(
+    name: str, contents: list[str], depth_map: DepthMap, away: float = 1.0
+) -> rrb.Spatial3DView:
     """Return a view of the scene from above and in front, so that all of it is seen."""
     vertices = depth_map.vertices().reshape(-1, 3)
     vertices = vertices[np.isfinite(vertices).all(axis=1)]
@@ -90,7 +94,7 @@ def _scene(name: str, contents: list[str], depth_map: DepthMap) -> rrb.Spatial3D
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=centre + size * (0.75 * up - 0.55 * along),
+            position=centre + away * size * (0.75 * up - 0.55 * along),
             look_target=centre,
             eye_up=up,
         ),
@@ -105,6 +109,6 @@ def _curves(name: str, origin: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        plot_legend=rrb.PlotLegend(visible=origin != "/residual"),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=origin != "/residual"),
         axis_x=rrb.TimeAxis(link=rr.blueprint.components.LinkAxis.Independent),
     )

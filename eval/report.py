@@ -31,6 +31,17 @@ NAMES = {
 }
 """The metrics that a table for people shows, in its order; the others are per axis."""
 
+SHORT_NAMES = {
+    "translation_mae": "Translation error",
+    "rotation_mae": "Rotation error",
+    "ate_rmse": "Trajectory error (ATE)",
+    "spread_median": "Frames disagree, median",
+    "spread_p90": "Frames disagree, 90 %",
+    "point_to_plane_median": "Point to plane",
+    "nees_per_dof": "NEES (1 is honest)",
+}
+"""The same for where there is little room."""
+
 VERDICTS = {
     "converged": "Converged",
     "not_converged": "Not to be trusted: not converged",
@@ -72,11 +83,17 @@ def figures_page(name: str, result: Result, metrics: Sequence[Metric]) -> str:
 
     """
     parts = [
-        f"# {name}",
+        f"## {name}",
         f"**{VERDICTS.get(result.status, result.status)}.** {result.reason}",
     ]
     if metrics:
-        parts.append(figures_table(*split(metrics)))
+        estimate, before = ({m.name: m for m in ms} for ms in split(metrics))
+        rows = [
+            [words, show(before[n]) if n in before else "", f"**{show(estimate[n])}**"]
+            for n, words in SHORT_NAMES.items()
+            if n in estimate
+        ]
+        parts.append(_table(["", "Start", "depthba"], rows))
     else:
         parts.append("Not judged yet: `depthba evaluate` adds the figures.")
     for w in result.weak:
