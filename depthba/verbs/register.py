@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from depthba.options import Options
-from depthba.result import Iteration, Result
 from depthba.verbs import DONE, NOT_TO_BE_TRUSTED
 from depthba.verbs.output import angle, length, note, print_json
 
 if TYPE_CHECKING:
     from depthba.dataset import Dataset
+    from depthba.result import Iteration, Result
 
 
 @dataclass(frozen=True)
