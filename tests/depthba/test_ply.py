@@ -94,7 +94,7 @@ def test_malformed(case: str, tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=200)
 @given(st.integers(0, len(GOOD) - 1), st.integers(0, 255), st.booleans())
 def test_damage_is_never_worse_than_a_known_error(at: int, byte: int, cut: bool) -> None:
     data = GOOD[:at] if cut else GOOD[:at] + bytes([byte]) + GOOD[at + 1 :]
