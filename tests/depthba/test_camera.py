@@ -52,7 +52,7 @@ def test_only_positive_finite_depths_are_measurements() -> None:
 def test_pixels_that_no_ray_reaches_give_no_points() -> None:
     folding = Camera(64, 48, 20.0, 20.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0))
     rays = folding.rays()
-    reached = np.isfinite(rays).all(axis=-1)
+    reached = np.asarray(np.isfinite(rays).all(axis=-1))
     assert 0.2 < reached.mean() < 0.9
     assert reached[23, 31] and not reached[0, 0]
     # the radius x(1 - 0.3 x^2) turns round at 1/sqrt(0.9): no ray may lie behind that
