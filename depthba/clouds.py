@@ -78,15 +78,19 @@ def point_spacing(dataset: Dataset, points: Sequence[NDArray[np.floating]]) -> f
 
 def transform(T: Floats, points: NDArray[np.floating]) -> Floats:
     """Return ``T`` (4, 4) applied to ``points`` (n, 3)."""
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+    x, y, z = points.T
+    # column by column: for three columns a matrix product costs more in threads than it saves
+    return np.stack([(r[0] * x + r[1] * y) + (r[2] * z + r[3]) for r in T[:3]], axis=1)
 
 
 def inside(points: NDArray[np.floating], roi: Sequence[float] | None) -> NDArray[np.bool_]:
     """Return which of ``points`` (n, 3) lie in ``roi``: xmin xmax ymin ymax zmin zmax, or None for all."""
     if roi is None:
         return np.ones(len(points), dtype=bool)
-    box = np.asarray(roi, dtype=float)
-    return np.asarray(np.all((points >= box[0::2]) & (points <= box[1::2]), axis=1))
+    keep = np.ones(len(points), dtype=bool)
+    for axis, low, high in zip(points.T, roi[0::2], roi[1::2], strict=True):
+        keep &= (axis >= low) & (axis <= high)
+    return keep
 
 
 def thin(rows: Floats, voxel: float) -> Floats:

@@ -28,7 +28,17 @@ Floats = NDArray[np.float64]
 CELL_SPACINGS = 4.0
 """Cells of the spread are this many point spacings wide: enough points for a mean, small enough for slopes."""
 EMPTY, DARK = "#e9e9ec", "#121212"
-HEIGHTS, SPREADS = "gist_earth", "inferno_r"
+SPREADS = "inferno_r"
+HEIGHTS = (
+    (66, 104, 138),
+    (104, 158, 160),
+    (154, 196, 148),
+    (214, 214, 150),
+    (226, 178, 116),
+    (204, 128, 98),
+    (240, 224, 214),
+)
+"""Colours from low to high, light enough for the shade to be seen on them."""
 BEFORE, AFTER = "Before: start poses", "After: depthba"
 
 
@@ -120,7 +130,7 @@ def before_after(
     options: Options | None = None,
     clouds: Sequence[FrameCloud] | None = None,
 ) -> None:
-    """Draw a compact picture for a page: the disagreement of the frames before and after, and the map.
+    """Draw a compact picture for a page: the map that the start poses give, and the map after.
 
     Args:
         result: what to draw.
@@ -133,24 +143,21 @@ def before_after(
     clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
     both = spreads(result, dataset, clouds, options.roi if options else None)
     box = _extent(result.depth_map)
-    panel = np.clip(4.35 * (box[3] - box[2]) / (box[1] - box[0]), 1.8, 5.5)
-    figure = _figure(15.0, panel + 0.6)
-    axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    for ax, spread, title in zip(
-        axes[:2], (both.before, both.after), ("Start poses", "After depthba"), strict=True
+    panel = np.clip(6.2 * (box[3] - box[2]) / (box[1] - box[0]), 2.4, 7.5)
+    figure = _figure(13.6, panel + 0.5)
+    axes = figure.subplots(1, 2)
+    for ax, depth_map, spread, title in (
+        (axes[0], result.depth_map_start, both.before, "Start poses"),
+        (axes[1], result.depth_map, both.after, "After depthba"),
     ):
-        image = _draw_spread(ax, spread, both.top)
+        relief = _draw_relief(ax, depth_map, _height_range(result))
         median = millimetres(spread.quantile(0.5))
         ax.set_title(f"{title}: frames disagree by {median}", fontweight="bold")
-    _bar(figure, image, axes[:2], "spread between frames (mm)", extend="max")
-    relief = _draw_relief(axes[2], result.depth_map, _height_range(result))
-    axes[2].set_title("The map", fontweight="bold")
-    _bar(figure, relief, axes[2:], "height (m)")
-    for ax in axes:
         _frame(ax, box)
         ax.set_xticks([])
         ax.set_yticks([])
         _scale_bar(ax, box)
+    _bar(figure, relief, axes, "height (m)")
     _save(figure, path, dpi=100)
 
 
@@ -175,18 +182,16 @@ def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
 def height_colours(
     heights: Floats, low: float | None = None, high: float | None = None
 ) -> NDArray[np.uint8]:
-    """Return (..., 3) colours for ``heights``, from ``low`` to ``high`` m; by default 1 % to 99 % of them."""
-    from matplotlib import colormaps
-
+    """Return (..., 3) colours for ``heights``, from ``low`` to ``high`` m; by default 2 % to 98 % of them."""
     known = heights[np.isfinite(heights)]
     if not len(known):
         return np.full((*heights.shape, 3), 230, np.uint8)
-    low = float(np.quantile(known, 0.01)) if low is None else low
-    high = float(np.quantile(known, 0.99)) if high is None else high
+    low = float(np.quantile(known, 0.02)) if low is None else low
+    high = float(np.quantile(known, 0.98)) if high is None else high
     level = np.clip((heights - low) / max(high - low, 1e-12), 0.0, 1.0)
-    # the ends of this colour map are black and white: no room for shade, or "nothing there"
-    rgba = colormaps[HEIGHTS](0.2 + 0.72 * np.nan_to_num(level))
-    return np.rint(255.0 * rgba[..., :3]).astype(np.uint8)
+    stops = np.linspace(0.0, 1.0, len(HEIGHTS))
+    rgb = [np.interp(np.nan_to_num(level), stops, channel) for channel in np.transpose(HEIGHTS)]
+    return np.rint(np.stack(rgb, axis=-1)).astype(np.uint8)
 
 
 def shade(heights: Floats, spacing: float) -> Floats:
@@ -203,13 +208,13 @@ def shade(heights: Floats, spacing: float) -> Floats:
     filled = heights[tuple(nearest)]  # holes must not darken their rims
     slope_y, slope_x = np.gradient(filled, spacing)
     steep = float(np.median(np.hypot(slope_x, slope_y)[known]))
-    stretch = np.clip(0.35 / max(steep, 1e-9), 0.5, 8.0)
+    stretch = np.clip(0.25 / max(steep, 1e-9), 0.4, 6.0)
     slope_x, slope_y = stretch * slope_x, stretch * slope_y
     light = np.array([-1.0, 1.0, 1.6]) / np.linalg.norm([-1.0, 1.0, 1.6])
     lit = (-slope_x * light[0] - slope_y * light[1] + light[2]) / np.sqrt(
         1 + slope_x**2 + slope_y**2
     )
-    return np.where(known, np.clip(lit / light[2], 0.25, 1.45), np.nan)
+    return np.where(known, np.clip(lit / light[2], 0.35, 1.25), np.nan)
 
 
 def relief_image(depth_map: DepthMap, low: float, high: float) -> NDArray[np.uint8]:
@@ -270,7 +275,7 @@ def _height_range(result: Result) -> tuple[float, float]:
     known = result.depth_map.heights[np.isfinite(result.depth_map.heights)]
     if not len(known):
         return 0.0, 1.0
-    low, high = np.quantile(known, [0.01, 0.99])
+    low, high = np.quantile(known, [0.02, 0.98])
     return float(low), float(high)
 
 

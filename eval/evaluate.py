@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import time
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from depthba.errors import OptionError, RunError
 from depthba.picture import CELL_SPACINGS
 from depthba.run_folder import Run
 from eval.metrics import Metric, consistency, pose_metrics, start
+from eval.review import RECORDING
 from eval.self_consistency import agreement, map_rotation
 
 Floats = NDArray[np.float64]
@@ -82,12 +84,21 @@ def save(
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
 ) -> Evaluation:
-    """Judge a run and leave metrics.json and report.md in its folder; see `evaluate`."""
+    """Judge a run and leave metrics.json and report.md in its folder; see `evaluate`.
+
+    A recording there gets the figures too.
+    """
     from eval.report import report  # which needs this module's types
 
     judged = judge(run, dataset, truth, cell)
     durable.write_json(judged.run.path / "metrics.json", as_json(judged))
     durable.write_text(judged.run.path / "report.md", report(judged))
+    recording = judged.run.path / RECORDING
+    if recording.is_file() and importlib.util.find_spec("rerun") is not None:
+        from eval.recording import add_figures  # rerun takes a second to import
+
+        figures = [*judged.metrics, *start(judged.start_metrics)]
+        add_figures(recording, judged.run.result, figures)
     return judged
 
 

@@ -95,9 +95,7 @@ class RecordedMap:
         triangles = _triangles(np.isfinite(depth_map.heights[::step, ::step]))
         rec.log(
             "map/surface",
-            rr.Mesh3D(
-                vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colours
-            ),
+            rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colours),
         )
 
 

@@ -16,6 +16,7 @@ Iteration 0 is the start, iteration k + 1 what step k left. Frames count from 0 
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,25 +24,27 @@ from typing import Any
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
 
 from depthba import se3
 from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, transform
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
+from depthba.errors import RunError
 from depthba.options import Options
 from depthba.picture import spread_png, spreads
 from depthba.result import Iteration, Result
-from depthba.run_folder import versions
+from depthba.run_folder import summary
 from depthba.spread import MAD_TO_SIGMA
 from eval.metrics import Metric, pose_errors
 from eval.recorded_map import RecordedMap, residuals
 from eval.recording_layout import blueprint, frame_colours
 from eval.report import figures_page
+from eval.review import viewer
 
 Floats = NDArray[np.float64]
 
 APPLICATION = "depthba"
-NAME = "run.rrd"
 CLOUD_POINTS = 160_000
 """Points of all frames together; each is recorded twice at 12 bytes, before and after."""
 RESIDUAL_POINTS = 2_000
@@ -130,14 +133,13 @@ class Recorder:
         self._time(0, 0.0)
         self._state(result.T_world_camera_start, result.depth_map_start)
         self._before(result)
-        page = figures_page(self._dataset.name, result, metrics)
+        run = summary(result, self._options, self._dataset)
         rec = self._stream
-        rec.log("figures", rr.TextDocument(page, media_type="text/markdown"), static=True)
-        rec.send_property("run", rr.AnyValues(**_facts(self._dataset, self._options, result)))
-        if metrics:
-            values = {m.name: m.value for m in metrics if np.isfinite(m.value)}
-            rec.send_property("metrics", rr.AnyValues(**values))
-        rec.send_blueprint(blueprint(result.depth_map, truth=self._true is not None))
+        rec.send_property("run", rr.AnyValues(**_facts(run)))
+        _log_figures(rec, run, metrics)
+        rec.send_blueprint(
+            blueprint(result.depth_map, result.T_world_camera, truth=self._true is not None)
+        )
         rec.flush()
         rec.disconnect()
         self._part.replace(self.path)
@@ -239,23 +241,68 @@ class Recorder:
                 self._stream.log(path, rr.Scalars(value))
 
 
-def _facts(dataset: Dataset, options: Options, result: Result) -> dict[str, Any]:
-    """Return what programs ask many recordings for."""
-    facts: dict[str, Any] = {
-        "dataset": dataset.name,
-        "preset": options.preset,
-        "init": options.init,
-        "status": result.status,
-        "frames": len(result.frame_ids),
-        "iterations": len(result.history),
-        "seconds": float(sum(result.seconds.values())),
-        "sigma": result.sigma,
-        "map_spacing": result.depth_map.spacing,
-        **{f"version_{k}": v for k, v in versions().items()},
+def add_figures(path: Path, run: Mapping[str, Any], metrics: Sequence[Metric]) -> None:
+    """Put the metrics into a recording that is there already.
+
+    Args:
+        path: the recording.
+        run: what result.json holds.
+        metrics: as `eval.evaluate.evaluate` returns them.
+
+    Raises:
+        RunError: the recording is broken.
+
+    """
+    whole, more = (path.with_name(f".{path.name}.{os.getpid()}.{part}") for part in ("part", "add"))
+    try:
+        entry = next(iter(RrdReader(path).recordings()))
+        rec = rr.RecordingStream(
+            entry.application_id, recording_id=entry.recording_id, send_properties=False
+        )
+        rec.set_log_tick_enabled(False)
+        rec.set_log_time_enabled(False)
+        rec.save(more)
+        _log_figures(rec, run, metrics)
+        rec.flush()
+        rec.disconnect()
+        merge = [str(viewer()), "rrd", "merge", str(path), str(more), "-o", str(whole)]
+        subprocess.run(merge, check=True, capture_output=True)
+        whole.replace(path)
+    except (OSError, ValueError, RuntimeError, StopIteration, subprocess.CalledProcessError) as e:
+        raise RunError(f"{path}: cannot add the figures to this recording: {e}") from e
+    finally:
+        whole.unlink(missing_ok=True)
+        more.unlink(missing_ok=True)
+
+
+def _log_figures(
+    rec: rr.RecordingStream, run: Mapping[str, Any], metrics: Sequence[Metric]
+) -> None:
+    """Record the metrics, as a page and as properties."""
+    page = rr.TextDocument(figures_page(run, metrics), media_type="text/markdown")
+    rec.log("figures", page, static=True)
+    values = {m.name: m.value for m in metrics if np.isfinite(m.value)}
+    if values:
+        rec.send_property("metrics", rr.AnyValues(**values))
+
+
+def _facts(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what programs ask many recordings for, from what result.json holds."""
+    facts = {
+        "dataset": run["name"],
+        "preset": run["options"]["preset"],
+        "init": run["options"]["init"],
+        "seed": run["dataset"]["seed"],
+        "status": run["status"],
+        "frames": len(run["frames"]),
+        "iterations": run["iterations"],
+        "seconds": run["seconds"].get("total"),
+        "sigma": run["sigma"],
+        "map_spacing": run["map"]["spacing"],
+        **{f"version_{k}": v for k, v in run["versions"].items()},
+        "version_rerun": rr.__version__,
     }
-    if dataset.seed is not None:
-        facts["seed"] = dataset.seed
-    return facts
+    return {name: value for name, value in facts.items() if value is not None}
 
 
 def _log10(value: float) -> float:

@@ -14,6 +14,8 @@ from depthba.depth_map import DepthMap
 Floats = NDArray[np.float64]
 
 BACKGROUND = (24, 26, 30)
+TAN_HALF_VIEW = 0.42
+"""Tangent of half the angle that the viewer's eye takes in, in height."""
 
 
 def frame_colours(count: int) -> NDArray[np.uint8]:
@@ -31,15 +33,30 @@ def frame_colours(count: int) -> NDArray[np.uint8]:
     ).reshape(count, 3)
 
 
-def blueprint(depth_map: DepthMap, *, truth: bool) -> rrb.Blueprint:
-    """Arrange the views: before on the left, after in the middle, figures, map and curves on the right."""
+def blueprint(depth_map: DepthMap, T_world_camera: Floats, *, truth: bool) -> rrb.Blueprint:
+    """Arrange the views: before on the left, after in the middle, figures and map on the right.
+
+    Args:
+        depth_map: the final map, (4, 4) axes and extent of which say where to look from.
+        T_world_camera: (N, 4, 4), the final poses, which should be seen.
+        truth: whether there are curves of errors.
+
+    """
+    centres = T_world_camera[:, :3, 3]
     before = rrb.Vertical(
-        _scene("BEFORE: frames at their start poses", ["/before/**", "/centres/start"], depth_map),
+        _scene(
+            "BEFORE: frames at their start poses",
+            ["/before/**", "/centres/start"],
+            depth_map,
+            centres,
+        ),
         _above("BEFORE: how far the frames disagree", "/spread/before"),
         row_shares=[3, 2],
     )
     after = rrb.Vertical(
-        _scene("AFTER: frames as depthba places them", ["/cam/**", "/centres/**"], depth_map),
+        _scene(
+            "AFTER: frames as depthba places them", ["/cam/**", "/centres/**"], depth_map, centres
+        ),
         _above("AFTER: how far the frames disagree", "/spread/after"),
         row_shares=[3, 2],
     )
@@ -56,36 +73,37 @@ def blueprint(depth_map: DepthMap, *, truth: bool) -> rrb.Blueprint:
     told = rrb.Vertical(
         rrb.TextDocumentView(origin="/figures", name="Figures"),
         rrb.Tabs(
-            _scene("Map", ["/map/surface"], depth_map, away=0.65),
+            _scene("Map", ["/map/surface"], depth_map, np.zeros((0, 3))),
             _above("Map from above", "/map/picture"),
         ),
         rrb.Tabs(*curves, active_tab=0),
-        row_shares=[4, 3, 3],
+        row_shares=[5, 4, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(before, after, told, column_shares=[5, 5, 5]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline="iteration", play_state="following"
-        ),
+        rrb.TimePanel(state="collapsed", timeline="iteration", play_state="following"),
         auto_views=False,
         auto_layout=False,
     )
 
 
 def _scene(
-    name: str, contents: list[str], depth_map: DepthMap, away: float = 1.0
+    name: str, contents: list[str], depth_map: DepthMap, centres: Floats
 ) -> rrb.Spatial3DView:
-    """Return a view of the scene from above and in front, so that all of it is seen."""
+    """Return a view from above and in front, from where the map and the cameras are all seen."""
     vertices = depth_map.vertices().reshape(-1, 3)
     vertices = vertices[np.isfinite(vertices).all(axis=1)]
     if not len(vertices):
         return rrb.Spatial3DView(origin="/", contents=contents, name=name)
-    # the map frame's axes in the world
-    along, up = depth_map.T_map_world[1, :3], depth_map.T_map_world[2, :3]
-    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    across, along, up = depth_map.T_map_world[:3, :3]
+    back = 0.8 * up - 0.6 * along
+    seen = np.concatenate([vertices, centres])
+    target = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    # the nearest place on that line from which every point lies within the view's angle
+    depth, side, rise = ((seen - target) @ axis for axis in (back, across, np.cross(back, across)))
+    distance = 1.08 * np.max(depth + np.maximum(np.abs(side), np.abs(rise)) / TAN_HALF_VIEW)
     return rrb.Spatial3DView(
         origin="/",
         contents=contents,
@@ -94,8 +112,8 @@ def _scene(
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=centre + away * size * (0.75 * up - 0.55 * along),
-            look_target=centre,
+            position=target + distance * back,
+            look_target=target,
             eye_up=up,
         ),
     )

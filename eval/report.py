@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from depthba.result import Result
 from eval.metrics import Metric, split
 
 if TYPE_CHECKING:
@@ -55,14 +54,14 @@ def report(judged: Evaluation) -> str:
     run = judged.run.result
     parts = [
         f"# {judged.run.name}",
-        f"**{VERDICTS.get(run['status'], run['status'])}.** {run['reason']}",
+        _verdict(run),
         "![The map and the disagreement of frames, before and after](map.png)",
         "## Before and after",
         figures_table(judged.metrics, judged.start_metrics),
         _explanation(judged),
         *_axes(judged),
         *_weak(run["weak"]),
-        *_held(run["frames"]),
+        *_held_frames(run["frames"]),
         "## Frames",
         _frames(run["frames"]),
         "## How it was run",
@@ -73,19 +72,15 @@ def report(judged: Evaluation) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def figures_page(name: str, result: Result, metrics: Sequence[Metric]) -> str:
+def figures_page(run: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a short page in Markdown for beside the pictures.
 
     Args:
-        name: of the dataset.
-        result: the run.
-        metrics: those of the estimate and of the start poses, as `eval.evaluate.evaluate` returns them.
+        run: what result.json holds.
+        metrics: as `eval.evaluate.evaluate` returns them, or none.
 
     """
-    parts = [
-        f"## {name}",
-        f"**{VERDICTS.get(result.status, result.status)}.** {result.reason}",
-    ]
+    parts = [f"## {run['name']}", _verdict(run)]
     if metrics:
         estimate, before = ({m.name: m for m in ms} for ms in split(metrics))
         rows = [
@@ -96,13 +91,16 @@ def figures_page(name: str, result: Result, metrics: Sequence[Metric]) -> str:
         parts.append(_table(["", "Start", "depthba"], rows))
     else:
         parts.append("Not judged yet: `depthba evaluate` adds the figures.")
-    for w in result.weak:
-        parts.append(f"- frame {w.frame} is open along {w.name}: held by its measured pose")
-    parts += [f"- frame {f.frame} is held at its start pose: {f.held}" for f in result.frames if f.held]
-    seconds = result.seconds.get("total", sum(result.seconds.values()))
+    open_ones = [
+        f"- frame {w['frame']} is held by its measured pose along {w['name']}" for w in run["weak"]
+    ]
+    open_ones += [f"- frame {f['frame']} is held: {f['held']}" for f in _held(run["frames"])]
+    if open_ones:
+        parts.append("\n".join(open_ones))
+    seconds = run["seconds"].get("total", sum(run["seconds"].values()))
     parts.append(
-        f"{len(result.frame_ids)} frames, {len(result.history)} iterations, {three_digits(seconds)} s, "
-        f"map spacing {_mm(result.depth_map.spacing)}"
+        f"{len(run['frames'])} frames, {run['iterations']} iterations, {three_digits(seconds)} s, "
+        f"map spacing {_mm(run['map']['spacing'])}"
     )
     return "\n\n".join(parts) + "\n"
 
@@ -120,6 +118,11 @@ def figures_table(metrics: Sequence[Metric], start_metrics: Sequence[Metric]) ->
     return _table(["", "Start poses", "depthba", "Better by"], rows)
 
 
+def _verdict(run: Mapping[str, Any]) -> str:
+    reason = str(run["reason"])
+    return f"**{VERDICTS.get(run['status'], run['status'])}.** {reason[:1].upper()}{reason[1:]}."
+
+
 def show(metric: Metric) -> str:
     """Return a metric's value for people, three digits: millimetres, milliradians or a bare number."""
     unit = {"m": " mm", "rad": " mrad", "1": ""}[metric.unit]
@@ -129,7 +132,9 @@ def show(metric: Metric) -> str:
 
 def three_digits(value: float) -> str:
     """Return a number with three digits and no exponent; the far end of small ones is cut."""
-    digits = 2 - int(np.floor(np.log10(abs(value)))) if value else 2
+    if not value:
+        return "0"
+    digits = 2 - int(np.floor(np.log10(abs(value))))
     return f"{value:.{min(max(digits, 0), 5)}f}"
 
 
@@ -191,12 +196,14 @@ def _weak(weak: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _held(frames: Sequence[dict[str, Any]]) -> list[str]:
-    held = [f for f in frames if f["held"]]
-    if not held:
-        return []
-    lines = [f"- frame {f['frame']}: {f['held']}" for f in held]
-    return ["## Frames held at their start poses", "\n".join(lines)]
+def _held(frames: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the frames that were held; not the first, which fixes the frame of reference."""
+    return [f for f in frames[1:] if f["held"]]
+
+
+def _held_frames(frames: Sequence[dict[str, Any]]) -> list[str]:
+    held = [f"- frame {f['frame']}: {f['held']}" for f in _held(frames)]
+    return ["## Frames held at their start poses", "\n".join(held)] if held else []
 
 
 def _frames(frames: Sequence[dict[str, Any]]) -> str:
@@ -208,9 +215,9 @@ def _frames(frames: Sequence[dict[str, Any]]) -> str:
             _percent(f["inliers"]),
             _mm(f["move_t"]),
             _mrad(f["move_r"]),
-            "held" if f["held"] else "",
+            ("" if k else "fixed") if not f["held"] or not k else "held",
         ]
-        for f in frames
+        for k, f in enumerate(frames)
     ]
     head = ["Frame", "Points", "Overlap", "Inliers", "Moved", "Turned", ""]
     return _table(head, rows)
@@ -219,7 +226,9 @@ def _frames(frames: Sequence[dict[str, Any]]) -> str:
 def _facts(judged: Evaluation) -> str:
     run, options = judged.run.result, judged.run.config
     stages = ", ".join(f"{k} {three_digits(v)} s" for k, v in run["seconds"].items())
-    noise = f"{_mm(run['sigma'])}; inflation of the covariance by correlation {run['inflation']:.3g}"
+    noise = (
+        f"{_mm(run['sigma'])}; inflation of the covariance by correlation {run['inflation']:.3g}"
+    )
     rows = [
         ["Dataset", f"{judged.dataset.name}, {len(judged.run.stamps)} frames"],
         ["Preset", str(options.get("preset"))],

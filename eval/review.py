@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -61,9 +62,7 @@ def viewer() -> Path:
     try:
         import rerun_cli
     except ImportError:
-        raise MissingPackage(
-            "rerun-sdk is not installed: pip install 'depthba[eval]'"
-        ) from None
+        raise MissingPackage("rerun-sdk is not installed: pip install 'depthba[eval]'") from None
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     return Path(str(rerun_cli.__file__)).parent / name
 
@@ -111,7 +110,6 @@ def screenshot(files: Sequence[Path], picture: Path) -> None:
             **os.environ,
             "DISPLAY": display,
             "VK_DRIVER_FILES": str(driver),
-            "WINIT_X11_SCALE_FACTOR": "1",
             "XDG_RUNTIME_DIR": folder,
         }
         environment.pop("WAYLAND_DISPLAY", None)
@@ -149,14 +147,20 @@ def _command() -> list[str]:
 
 
 def _run(command: Sequence[str]) -> None:
-    """Run the viewer until it ends or the user interrupts."""
-    process = subprocess.Popen(command)
+    """Run the viewer until it ends, the user interrupts or somebody ends this process."""
+
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)  # so that the viewer is ended below, and not orphaned
+
+    before = signal.signal(signal.SIGTERM, leave)
+    process = subprocess.Popen(command, env={"RUST_LOG": "warn", **os.environ})
     try:
         status = process.wait()
     except KeyboardInterrupt:
         return
     finally:
         _end(process)
+        signal.signal(signal.SIGTERM, before)
     if status:
         raise RunError(f"{command[0]}: the viewer ended with status {status}")
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from depthba import se3
 from depthba.clouds import inside, thin, transform
 from depthba.dataset import Dataset
 from depthba.spread import CellSpread, cell_spread
@@ -75,8 +76,11 @@ def agreement(
     world = []
     for p, T in zip(points, T_world_camera, strict=True):
         p_world = transform(T, p)
-        world.append(p_world[inside(transform(into, p_world), roi)] if roi is not None else p_world)
-    spread = cell_spread([p @ R_map_world.T for p in world], cell)
+        if roi is not None:
+            p_world = p_world[inside(transform(into, p_world), roi)]
+        world.append(p_world)
+    turn = se3.make(R_map_world, np.zeros(3))
+    spread = cell_spread([transform(turn, p) for p in world], cell)
     return Agreement(spread, _point_to_plane(world, [f.cells for f in spread.frames], cell))
 
 
