@@ -1,7 +1,7 @@
 """Simulated capture: turns a scene and a seed into a dataset whose truth is exact.
 
-import sim
-sim.generate("industrial-6", "my-dataset", sim.GenerateOptions(seed=1, size=(320, 240)))
+`sim.generate("industrial-6", "my-dataset", sim.GenerateOptions(seed=1, size=(320, 240)))` does it
+all; what else is public here are its parts.
 """
 
 from __future__ import annotations

@@ -40,7 +40,9 @@ class GenerateOptions:
     size: tuple[int, int] | None = None
     """Image width and height, pixels. None: the sensor's own (SP1000: 1280 x 960)."""
     start_error: tuple[float, float] | None = None
-    """Instead of the rig's pose errors: independent Gaussian errors per axis, m and rad, frame 0 exact."""
+    """Instead of the rig's pose errors: independent Gaussian errors per axis; frame 0 is exact.
+
+    The standard deviations, m and rad."""
     clean: bool = False
     """Leave all noise out, of the depth and of the poses; start_error still counts."""
     pose_noise: float = 1.0
@@ -69,7 +71,8 @@ def generate(
     """Render a scene into the dataset folder `out` and return its path.
 
     A folder that holds the same dataset, cut short, is resumed. Raises SimulationError for an
-    unknown scene or stage, OptionError for a bad option, DatasetError where `out` holds other things.
+    unknown scene or stage, OptionError for a bad option, DatasetError where `out` holds anything
+    else.
     """
     report = progress or (lambda done, total, text: None)
     entry, out = find_scene(scene), Path(out)
@@ -172,7 +175,7 @@ def _open(out: Path, header: dict[str, Any]) -> tuple[DatasetWriter, int]:
         there = None
     if there != header:
         raise DatasetError(
-            f"{out}: expected a new or empty folder, or the same dataset cut short; found other files"
+            f"{out}: holds other files; expected a new folder, or the same dataset cut short"
         )
     writer = DatasetWriter.resume(out)
     return writer, len(Dataset.open(out))

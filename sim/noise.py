@@ -1,4 +1,4 @@
-"""What a sensor does to exact depth: a row of named stages, each seeded on its own and switchable."""
+"""What a sensor does to exact depth: a row of named stages, each with its own seed and switch."""
 
 from __future__ import annotations
 

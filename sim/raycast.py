@@ -1,7 +1,7 @@
 """Exact depth by casting rays with Embree against the triangles of a compiled MuJoCo model.
 
-Embree finds the triangle in single precision; the distance is then taken to that triangle's plane in
-double precision. Directions with camera z = 1 make the distance the depth itself. No GL is needed.
+Embree finds the triangle in single precision; the distance is then taken to that triangle's plane
+in double precision. Directions with camera z = 1 make the distance the depth. No GL is needed.
 """
 
 from __future__ import annotations

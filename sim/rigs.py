@@ -118,7 +118,7 @@ class Gantry:
         stations = self.stations(frames)
         down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
         T_true = se3.make(np.broadcast_to(down, (len(stations), 3, 3)), stations)
-        stamps = self.seconds * np.arange(len(stations))
+        stamps = np.asarray(self.seconds * np.arange(len(stations)), np.float64)
         if start_error is not None:
             return _perturbed(stamps, T_true, seed, start_error)
         if scale == 0.0:

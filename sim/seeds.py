@@ -1,4 +1,4 @@
-"""Random streams that do not disturb each other: a name and a seed give a generator of their own."""
+"""Random streams that do not disturb each other: a name and a seed give each its own."""
 
 from __future__ import annotations
 

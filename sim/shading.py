@@ -1,4 +1,4 @@
-"""Colour from the same rays as the depth: material colour, one light with shadows, ambient light."""
+"""Colour from the same rays as the depth: material, one lamp with shadows, ambient light."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from depthba.camera import Camera
 from sim.engine import mujoco
 from sim.raycast import Hits, RayScene
+from sim.seeds import stream
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -79,13 +80,21 @@ _GAMMA = np.asarray(255.0 * np.linspace(0.0, 1.0, 4096) ** (1.0 / 2.2) + 0.5, np
 """Linear light to screen values."""
 
 
-def _grain(points: Array) -> Array:
-    """Brightness of loose ground: speckled in cells of 7 and 25 mm, the same from every view."""
-    value = np.ones(len(points))
-    for cell, strength in ((0.007, 0.35), (0.025, 0.30)):
-        i, j = (np.floor(points[:, k] / cell).astype(np.int64) for k in (0, 1))
-        mixed = (i * 73856093 ^ j * 19349663) & 0xFFFFFFFF
-        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-        mixed = (mixed ^ (mixed >> 13)) & 0xFFFF
-        value += strength * (mixed / 65535.0 - 0.5)
-    return value
+def _grain(points: Array) -> NDArray[np.float32]:
+    """Brightness of loose ground: the speckles at points (n, 3), the same from every view."""
+    where = (points[:, :2] * (1.0 / _GRAIN_CELL)).astype(np.int32) & (len(_GRAIN) - 1)
+    return np.asarray(_GRAIN[where[:, 0], where[:, 1]])
+
+
+def _speckles(cells: int = 1024) -> NDArray[np.float32]:
+    """A tile of speckles one cell and four cells wide."""
+    rng = stream(0, "speckles")
+    fine = rng.random((cells, cells), np.float32)
+    coarse = np.kron(rng.random((cells // 4, cells // 4), np.float32), np.ones((4, 4), np.float32))
+    return np.asarray(1.0 + 0.35 * (fine - 0.5) + 0.30 * (coarse - 0.5), np.float32)
+
+
+_GRAIN_CELL = 0.007
+"""Width of a speckle, m."""
+
+_GRAIN = _speckles()

@@ -45,7 +45,7 @@ def triangles_of(
 ) -> Triangles:
     """The triangles of every visible geom (alpha above 0, group in `groups`) at the pose in `data`.
 
-    `data` must hold the forward kinematics. SimulationError names a geom of a kind without triangles.
+    `data` must hold the forward kinematics. SimulationError names a geom that has no triangles.
     """
     local: dict[tuple[object, ...], Mesh] = {}
     vertices, faces, owner = [], [], []

@@ -43,7 +43,7 @@ SCENES: dict[str, Scene] = {
     for scene in (
         Scene(
             "industrial-6",
-            "7 x 6 m bay of crushed stone, slag and scrap; a medium-thick plate with several planes",
+            "7 x 6 m bay of crushed stone, slag and scrap; a plate with several planes",
             "sim.scenes.industrial:industrial_6",
             rig="gantry",
             sensor="sp1000",

@@ -1,4 +1,4 @@
-"""The floor of the industrial bay: fines raked roughly level, with low heaps at the angle of repose."""
+"""The floor of the industrial bay: fines raked roughly level, and heaps at the angle of repose."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def make_ground(
     area: tuple[float, float, float, float],
     spacing: float,
     level: tuple[Keep, ...],
-    heaps: int = 7,
+    heaps: int = 10,
     repose: float = np.radians(34.0),
 ) -> Relief:
-    """The bare floor over `area` (xmin, xmax, ymin, ymax) m, level (z = 0) around the discs of `level`."""
-    columns = int(round((area[1] - area[0]) / spacing)) + 1
-    rows = int(round((area[3] - area[2]) / spacing)) + 1
-    x = area[0] + spacing * np.arange(columns)[None, :]
-    y = area[2] + spacing * np.arange(rows)[:, None]
+    """The bare floor over `area` (xmin, xmax, ymin, ymax) m; z = 0 on the discs of `level`."""
+    columns = round((area[1] - area[0]) / spacing) + 1
+    rows = round((area[3] - area[2]) / spacing) + 1
+    x = np.asarray(area[0] + spacing * np.arange(columns), np.float64)[None, :]
+    y = np.asarray(area[2] + spacing * np.arange(rows), np.float64)[:, None]
     # Undulation as left by a wheel loader: long swells and shorter ones, a few wavelengths only.
-    z = _swell(rng, (rows, columns), 0.90 / spacing, 0.030)
-    z += _swell(rng, (rows, columns), 0.22 / spacing, 0.011)
-    z += _swell(rng, (rows, columns), 0.09 / spacing, 0.0030)
+    z = _swell(rng, (rows, columns), 0.90 / spacing, 0.045)
+    z += _swell(rng, (rows, columns), 0.22 / spacing, 0.020)
+    z += _swell(rng, (rows, columns), 0.09 / spacing, 0.0055)
     for _ in range(heaps):
         z = np.maximum(z, _heap(rng, area, x, y, repose))
     z = gaussian_filter(z, 0.035 / spacing)
@@ -79,7 +79,7 @@ def _heap(
     """A tipped load: a ridge with slopes just under the angle of repose."""
     cx, cy = rng.uniform(area[0], area[1]), rng.uniform(area[2], area[3])
     heading, length = rng.uniform(0.0, np.pi), rng.uniform(0.1, 0.7)
-    height, steep = rng.uniform(0.14, 0.30), np.tan(repose) * rng.uniform(0.55, 0.95)
+    height, steep = rng.uniform(0.15, 0.36), np.tan(repose) * rng.uniform(0.6, 0.95)
     along = (x - cx) * np.cos(heading) + (y - cy) * np.sin(heading)
     across = -(x - cx) * np.sin(heading) + (y - cy) * np.cos(heading)
     outside = np.maximum(np.abs(along) - 0.5 * length, 0.0)

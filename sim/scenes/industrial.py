@@ -27,6 +27,7 @@ MARKER_THICKNESS = 0.002
 
 # The rubble goes on beyond the bay as far as the outermost frames see.
 _AREA = (-1.5, 8.5, -1.2, 7.2)
+_STREWN = (-1.3, 8.3, -1.0, 7.0)
 _SPACING = 0.025
 
 
@@ -38,9 +39,9 @@ def industrial_6(seed: int) -> mujoco.MjSpec:
     x, y = place.uniform(2.9, 4.1), place.uniform(2.5, 3.5)
     yaw = place.uniform(0.0, 2.0 * np.pi)
     plate = stepped_plate(place)
-    # No stone under the plate is so tall that it would hang in the air.
-    relief = _rubble(spec, seed, "industrial-6", (Keep(x, y, 0.9, above=0.15),))
-    rotation, position = rest_on_three(relief, x, y, yaw, plate.half[:2])
+    # No stone under the plate is so tall that it would hang in the air; 1.2 t press the rest down.
+    relief = _rubble(spec, seed, "industrial-6", (Keep(x, y, 0.9, above=0.14),))
+    rotation, position = rest_on_three(relief, x, y, yaw, plate.half[:2], pressed=0.5)
     colours = [np.array(STEEL[k % len(STEEL)]) for k in range(len(plate.parts))]
     add_body(spec, relief, plate, rotation, position, colours, name="plate")
     # Loading shook some stones onto it.
@@ -60,21 +61,21 @@ def _rubble(spec: mujoco.MjSpec, seed: int, scene: str, keep: tuple[Keep, ...] =
     wide = tuple(Keep(x, y, 0.35, above=0.12) for x, y in MARKERS.values())
     level = tuple(Keep(x, y, 0.06) for x, y in MARKERS.values())
     relief = make_ground(stream(seed, scene, "ground"), _AREA, _SPACING, level)
-    add_ground(spec, relief, (0.215, 0.195, 0.17))
+    add_ground(spec, relief, (0.15, 0.135, 0.117))
 
     rng = stream(seed, scene, "stones")
     sizes = np.geomspace(0.05, 0.40, 14)
     shapes = make_shapes(spec, rng, CRUSHED, sizes, 8)
     lumps = make_shapes(spec, rng, SLAG, sizes[:-2], 4)
     shapes = shapes + lumps
-    diameters = draw_diameters(rng, 1700, 0.05, 0.40, 1.9)
+    diameters = draw_diameters(rng, 2600, 0.05, 0.40, 2.1)
     large = diameters > 0.18
     everywhere = clear + wide + keep
-    scatter(spec, rng, relief, shapes, diameters[large], _AREA, everywhere)
     scrap = stream(seed, scene, "scrap")
     off = tuple(Keep(k.x, k.y, k.radius + 0.25) for k in clear + keep)
-    scatter_scrap(spec, scrap, relief, 55, _AREA, off)
-    scatter(spec, rng, relief, shapes, diameters[~large], _AREA, everywhere)
+    scatter_scrap(spec, scrap, relief, 55, _STREWN, off)
+    scatter(spec, rng, relief, shapes, diameters[large], _STREWN, everywhere)
+    scatter(spec, rng, relief, shapes, diameters[~large], _STREWN, everywhere)
 
     for name, (x, y) in MARKERS.items():
         half = 0.5 * MARKER_THICKNESS

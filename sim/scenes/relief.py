@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class Hull(NamedTuple):
-    """A convex body: vertices (n, 3) m, outward faces (m, 3), and planes (k, 4) with n.x + d <= 0 inside."""
+    """A convex body: vertices (n, 3) m, outward faces (m, 3), planes (k, 4) with n.x + d <= 0."""
 
     vertices: Array
     faces: NDArray[np.int64]
@@ -44,6 +44,15 @@ def box_planes(size: tuple[float, float, float]) -> Array:
 def turned(planes: Array, rotation: Array) -> Array:
     """Planes (k, 4) of a body after a rotation (3, 3) about its origin."""
     return np.column_stack([planes[:, :3] @ rotation.T, planes[:, 3]])
+
+
+def frame(up: Array, ahead: Array) -> Array:
+    """The rotation (3, 3) whose z axis is along `up` and whose x axis is nearest to `ahead`."""
+    z = up / np.sqrt(up @ up)
+    x = ahead - (ahead @ z) * z
+    x /= np.sqrt(x @ x)
+    y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
+    return np.column_stack([x, y, z])
 
 
 @dataclass
@@ -85,13 +94,15 @@ class Relief:
         self.z[where] = np.where(top >= bottom, np.maximum(self.z[where], top + z), self.z[where])
 
     def bed(self, planes: Array, x: float, y: float, radius: float, sink: float) -> float:
-        """The height at which a convex body lies when a share `sink` of its underside has sunk in."""
+        """The height at which a body lies when a share `sink` of its underside has sunk in."""
         where, dx, dy = self.window(x, y, radius)
         bottom, top = _span(planes, dx, dy)
         inside = top >= bottom
         if not inside.any():
             return float(self.at(x, y))
-        return float(np.quantile((self.z[where] - bottom)[inside], 1.0 - sink))
+        touch = (self.z[where] - bottom)[inside]
+        order = int((1.0 - sink) * (len(touch) - 1))
+        return float(np.partition(touch, order)[order])
 
 
 def _span(planes: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
@@ -108,12 +119,18 @@ def _span(planes: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
 
 
 def rest_on_three(
-    relief: Relief, x: float, y: float, yaw: float, half: tuple[float, float]
+    relief: Relief,
+    x: float,
+    y: float,
+    yaw: float,
+    half: tuple[float, float],
+    pressed: float = 0.0,
 ) -> tuple[Array, Array]:
     """How a flat-bottomed body of half lengths `half` m comes to rest: it stands on three points.
 
     Those are the corners of the upper convex hull's facet above which the centre of mass hangs, so
-    the pose is in static equilibrium. Returns the rotation (3, 3) and the bottom's centre (3,).
+    the pose is in static equilibrium. Its weight then takes it down by the share `pressed` of the
+    mean gap below it. Returns the rotation (3, 3) and the bottom's centre (3,).
     """
     cos, sin = np.cos(yaw), np.sin(yaw)
     reach = [np.arange(-h, h + 1e-9, max(relief.spacing, h / 60.0)) for h in half]
@@ -130,9 +147,7 @@ def rest_on_three(
         # Above the centre the hull's top is its lowest upper plane.
         facet = int(np.argmin(heights))
         normal, height = over[facet, :3], float(heights[facet])
+        plane = height - points[:, :2] @ normal[:2] / normal[2]
+        height -= pressed * float((plane - points[:, 2]).mean())
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    up = turn @ normal
-    side = np.cross(up, turn[:, 0])
-    side /= np.linalg.norm(side)
-    rotation = np.column_stack([np.cross(side, up), side, up])
-    return rotation, np.array([x, y, height])
+    return frame(turn @ normal, turn[:, 0]), np.array([x, y, height])

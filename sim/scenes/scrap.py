@@ -1,4 +1,4 @@
-"""Scrap: off-cuts of plate, beam, pipe and bar that lie on the rubble, each built from primitives."""
+"""Scrap: off-cuts of plate, beam, pipe and bar that lie on the rubble, built from primitives."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from sim.scenes.stones import Keep
 
 Array = NDArray[np.float64]
 
-RUST = ((0.26, 0.125, 0.07), (0.20, 0.10, 0.065), (0.31, 0.17, 0.10))
-STEEL = ((0.30, 0.31, 0.33), (0.22, 0.23, 0.25), (0.38, 0.38, 0.385))
+RUST = ((0.18, 0.082, 0.045), (0.13, 0.065, 0.042), (0.22, 0.115, 0.065))
+STEEL = ((0.17, 0.175, 0.185), (0.12, 0.125, 0.135), (0.22, 0.22, 0.222))
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Body:
-    """Parts that move together; z = 0 is the underside, `half` bounds it (x, y, z half lengths, m)."""
+    """Parts that move together; z = 0 is the underside, `half` its bounding half lengths, m."""
 
     parts: tuple[Part, ...]
     half: tuple[float, float, float]
@@ -136,7 +136,7 @@ def scatter_scrap(
     area: tuple[float, float, float, float],
     keep: tuple[Keep, ...],
 ) -> None:
-    """Lay pieces of scrap on the relief, each on the three points that carry it."""
+    """Lay pieces of scrap on the relief, where the loader has driven them into the fines."""
     for _ in range(count):
         body = KINDS[int(rng.integers(len(KINDS)))](rng)
         x, y = rng.uniform(area[0], area[1]), rng.uniform(area[2], area[3])
@@ -145,7 +145,5 @@ def scatter_scrap(
         colour = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.8, 1.2)
         if any(np.hypot(k.x - x, k.y - y) < k.radius + body.half[0] for k in keep):
             continue
-        rotation, position = rest_on_three(relief, x, y, yaw, body.half[:2])
-        # Old pieces have sunk a little into the fines.
-        position = position - rotation[:, 2] * min(0.3 * body.half[2], 0.012)
+        rotation, position = rest_on_three(relief, x, y, yaw, body.half[:2], pressed=0.7)
         add_body(spec, relief, body, rotation, position, [colour] * len(body.parts))

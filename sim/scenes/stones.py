@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
 from sim.engine import mujoco
-from sim.scenes.relief import Hull, Relief, hull_of, turned
+from sim.scenes.relief import Hull, Relief, frame, hull_of, turned
 
 Array = NDArray[np.float64]
 
@@ -33,10 +33,10 @@ class Family:
 CRUSHED = Family(
     "stone",
     False,
-    ((0.33, 0.31, 0.28), (0.25, 0.245, 0.24), (0.40, 0.37, 0.32), (0.29, 0.25, 0.21)),
+    ((0.24, 0.225, 0.20), (0.18, 0.178, 0.175), (0.30, 0.28, 0.245), (0.21, 0.18, 0.15)),
 )
 CHIPS = Family("chip", False, CRUSHED.colours)
-SLAG = Family("slag", True, ((0.115, 0.11, 0.115), (0.16, 0.135, 0.12), (0.19, 0.13, 0.095)))
+SLAG = Family("slag", True, ((0.085, 0.082, 0.086), (0.12, 0.105, 0.095), (0.15, 0.10, 0.072)))
 
 
 @dataclass(frozen=True)
@@ -142,15 +142,16 @@ def scatter(
     sizes = np.array([shape.diameter for shape in by_size])
     centres = np.array([[k.x, k.y, k.radius, k.above] for k in keep]).reshape(-1, 4)
     for diameter in diameters:
-        nearest = np.flatnonzero(np.isclose(sizes, sizes[np.abs(sizes - diameter).argmin()]))
-        shape = by_size[int(rng.choice(nearest))]
+        size = sizes[np.abs(sizes - diameter).argmin()]
+        first, last = np.searchsorted(sizes, [0.999 * size, 1.001 * size])
+        shape = by_size[int(rng.integers(first, last))]
         place = _place(rng, relief, shape.diameter, area, centres, repose)
         if place is None:
             continue
         x, y = place
         rotation = _lie(rng, relief.slope(x, y, 0.5 * shape.diameter))
         planes = turned(shape.hull.planes, rotation)
-        z = relief.bed(planes, x, y, shape.diameter, rng.uniform(0.15, 0.45))
+        z = relief.bed(planes, x, y, shape.diameter, rng.uniform(0.45, 0.75))
         relief.raise_to(planes, x, y, z, shape.diameter)
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
@@ -165,7 +166,10 @@ def _place(
     keep: Array,
     repose: float,
 ) -> tuple[float, float] | None:
-    x, y = rng.uniform(area[0], area[1]), rng.uniform(area[2], area[3])
+    # Loads are tipped in heaps: of two places a stone often takes the higher.
+    xs, ys = rng.uniform(area[0], area[1], 2), rng.uniform(area[2], area[3], 2)
+    pick = int(np.argmax(relief.at(xs, ys))) if rng.random() < 0.4 else 0
+    x, y = float(xs[pick]), float(ys[pick])
     for _ in range(12):
         gradient = relief.slope(x, y, 0.6 * diameter)
         steep = float(np.hypot(*gradient))
@@ -183,11 +187,8 @@ def _lie(rng: np.random.Generator, gradient: Array) -> Array:
     """A rotation that lays the flat side on the slope, give or take, with any heading."""
     up = np.array([-gradient[0], -gradient[1], 1.0])
     up = up / np.linalg.norm(up) + rng.normal(scale=0.16, size=3)
-    up /= np.linalg.norm(up)
     heading = rng.uniform(0.0, 2.0 * np.pi)
-    side = np.cross(up, [np.cos(heading), np.sin(heading), 0.0])
-    side /= np.linalg.norm(side)
-    return np.column_stack([np.cross(side, up), side, up])
+    return frame(up, np.array([np.cos(heading), np.sin(heading), 0.0]))
 
 
 def add_mesh_geom(

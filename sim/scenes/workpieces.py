@@ -8,7 +8,7 @@ from sim.scenes.scrap import CYLINDER, Body, Part, box
 
 
 def stepped_plate(rng: np.random.Generator) -> Body:
-    """A medium-thick plate with several planes: two plates welded on in steps, a bent-up end, a rib."""
+    """A medium-thick plate: two plates welded on in steps, a bent-up end, a rib, two bosses."""
     a, b, c = rng.uniform(0.95, 1.1), rng.uniform(0.58, 0.68), rng.uniform(0.025, 0.032)
     a1, b1, c1 = rng.uniform(0.45, 0.55), rng.uniform(0.36, 0.44), rng.uniform(0.018, 0.025)
     a2, b2, c2 = rng.uniform(0.2, 0.26), rng.uniform(0.16, 0.22), rng.uniform(0.025, 0.035)
