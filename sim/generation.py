@@ -165,17 +165,15 @@ def _header(
 
 def _open(out: Path, header: dict[str, Any]) -> tuple[DatasetWriter, int]:
     """A writer for the folder, and how many frames it already holds."""
-    if out.exists() and not out.is_dir():
-        raise DatasetError(f"{out}: expected a folder, found a file")
-    if not out.exists() or not any(out.iterdir()):
+    if not (out / "dataset.json").is_file():
         return DatasetWriter.create(out, header), 0
     try:
         there = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except ValueError:
         there = None
     if there != header:
         raise DatasetError(
-            f"{out}: holds other files; expected a new folder, or the same dataset cut short"
+            f"{out}: holds another dataset; expected a new folder, or the same cut short"
         )
     writer = DatasetWriter.resume(out)
     return writer, len(Dataset.open(out))

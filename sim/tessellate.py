@@ -1,7 +1,8 @@
 """Triangles of a compiled MuJoCo model, as the ray caster needs them.
 
-Meshes, boxes and height fields are exact. Round shapes are inscribed with 256 segments, which keeps
-the 99th percentile of the depth error at 0.024 mm (512: 0.006 mm).
+Meshes, boxes and height fields are exact. Round shapes have 256 segments whose corners stand out as
+far as their sides fall short: for a radius of 0.3 m that is 0.01 mm for a cylinder, 0.02 mm for a
+sphere.
 """
 
 from __future__ import annotations
@@ -133,7 +134,13 @@ def _rings(rings: Array, bottom: Array, top: Array) -> Mesh:
 
 def _circle(segments: int) -> Array:
     angle = 2.0 * np.pi * np.arange(segments) / segments
-    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(segments)])
+    radius = _middling(segments)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(segments)])
+
+
+def _middling(segments: int) -> float:
+    """The radius at which a polygon's corners stand out as far as its sides fall short of 1."""
+    return 2.0 / (1.0 + float(np.cos(np.pi / segments)))
 
 
 def _cylinder(size: Array, segments: int) -> Mesh:
@@ -153,7 +160,8 @@ def _ellipsoid(axes: Array, stretch: float, segments: int) -> Mesh:
     rings = (
         np.cos(latitude)[:, None, None] * _circle(segments) + np.sin(latitude)[:, None, None] * up
     )
-    rings = rings * axes + lift * up
+    # Its sides are curved along the meridian too: corners out by as much again.
+    rings = rings * _middling(segments) * axes + lift * up
     pole = up * (axes[2] + stretch)
     return _rings(rings, -pole, pole)
 

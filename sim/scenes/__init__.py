@@ -24,8 +24,8 @@ class Scene:
 
     id: str
     description: str
-    builder: str
-    """`module:function`, imported when the scene is built."""
+    builder: str | Callable[[int], mujoco.MjSpec]
+    """A function of the seed, or `module:function`, imported when the scene is built."""
     rig: str
     """Name of the rig in `sim.rigs`."""
     sensor: str
@@ -33,6 +33,8 @@ class Scene:
 
     def build(self, seed: int) -> mujoco.MjSpec:
         """The scene's specification; another seed gives another arrangement of the same kind."""
+        if callable(self.builder):
+            return self.builder(seed)
         module, function = self.builder.split(":")
         builder = getattr(importlib.import_module(module), function)
         return cast("Callable[[int], mujoco.MjSpec]", builder)(seed)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
@@ -65,11 +64,14 @@ class Relief:
 
     def at(self, x: Array | float, y: Array | float) -> Array:
         """Heights by bilinear interpolation; the border value outside."""
-        rows = (np.asarray(y, float) - self.origin[1]) / self.spacing
-        columns = (np.asarray(x, float) - self.origin[0]) / self.spacing
-        shape = np.broadcast_shapes(rows.shape, columns.shape)
-        where = np.array([np.broadcast_to(k, shape).ravel() for k in (rows, columns)])
-        return np.reshape(map_coordinates(self.z, where, order=1, mode="nearest"), shape)
+        rows, columns = self.z.shape
+        v = np.clip((np.asarray(y, float) - self.origin[1]) / self.spacing, 0.0, rows - 1.001)
+        u = np.clip((np.asarray(x, float) - self.origin[0]) / self.spacing, 0.0, columns - 1.001)
+        r, c = v.astype(np.intp), u.astype(np.intp)
+        v, u = v - r, u - c
+        below = self.z[r, c] * (1.0 - u) + self.z[r, c + 1] * u
+        above = self.z[r + 1, c] * (1.0 - u) + self.z[r + 1, c + 1] * u
+        return np.asarray(below * (1.0 - v) + above * v)
 
     def slope(self, x: float, y: float, reach: float) -> Array:
         """The gradient (2,) of the surface, taken over a distance `reach` m to either side."""
@@ -94,15 +96,21 @@ class Relief:
         self.z[where] = np.where(top >= bottom, np.maximum(self.z[where], top + z), self.z[where])
 
     def bed(self, planes: Array, x: float, y: float, radius: float, sink: float) -> float:
-        """The height at which a body lies when a share `sink` of its underside has sunk in."""
+        """Lay a convex body down at (x, y) and lift the surface to its top; returns its height.
+
+        It lies where a share `sink` of its underside has sunk into what was there.
+        """
         where, dx, dy = self.window(x, y, radius)
         bottom, top = _span(planes, dx, dy)
         inside = top >= bottom
-        if not inside.any():
+        old = self.z[where]
+        touch = (old - bottom)[inside]
+        if len(touch) == 0:
             return float(self.at(x, y))
-        touch = (self.z[where] - bottom)[inside]
         order = int((1.0 - sink) * (len(touch) - 1))
-        return float(np.partition(touch, order)[order])
+        z = float(np.partition(touch, order)[order])
+        self.z[where] = np.where(inside, np.maximum(old, top + z), old)
+        return z
 
 
 def _span(planes: Array, dx: Array, dy: Array) -> tuple[Array, Array]:

@@ -45,6 +45,8 @@ class Shape:
 
     mesh: str
     diameter: float
+    reach: float
+    """Radius of the sphere around its origin that holds it, m."""
     hull: Hull
     family: Family
 
@@ -67,7 +69,8 @@ def make_shapes(
             spec.add_mesh(
                 name=name, uservert=hull.vertices.ravel(), userface=hull.faces.ravel().astype(int)
             )
-            shapes.append(Shape(name, float(diameter), hull, family))
+            reach = float(np.linalg.norm(hull.vertices, axis=1).max())
+            shapes.append(Shape(name, float(diameter), reach, hull, family))
     return shapes
 
 
@@ -151,8 +154,7 @@ def scatter(
         x, y = place
         rotation = _lie(rng, relief.slope(x, y, 0.5 * shape.diameter))
         planes = turned(shape.hull.planes, rotation)
-        z = relief.bed(planes, x, y, shape.diameter, rng.uniform(0.45, 0.75))
-        relief.raise_to(planes, x, y, z, shape.diameter)
+        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.45, 0.75))
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
         add_mesh_geom(spec, shape.mesh, np.array([x, y, z]), rotation, colour)
