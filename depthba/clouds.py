@@ -1,4 +1,4 @@
-"""The frames' points with their colours: loaded once, carried into the world, cropped, merged and thinned."""
+"""The points of all frames with their colours: loaded, moved, cropped and thinned."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def load_clouds(dataset: Dataset, *, colours: bool = True) -> tuple[FrameCloud, 
 def point_spacing(dataset: Dataset, points: Sequence[NDArray[np.floating]]) -> float:
     """Return the typical distance of neighbouring points, metres.
 
-    Depth images: median over frames of the median depth over the focal length. Clouds: median distance to the
-    nearest neighbour in the sensor's x-y plane, from up to 2000 points a frame.
+    Depth images: median over frames of the median depth over the focal length. Clouds: median
+    distance to the nearest neighbour in the sensor's x-y plane, from up to 2000 points a frame.
 
     Args:
         dataset: whose sensor took the points.
@@ -84,7 +84,7 @@ def transform(T: Floats, points: NDArray[np.floating]) -> Floats:
 
 
 def inside(points: NDArray[np.floating], roi: Sequence[float] | None) -> NDArray[np.bool_]:
-    """Return which of ``points`` (n, 3) lie in ``roi``: xmin xmax ymin ymax zmin zmax, or None for all."""
+    """Return which ``points`` (n, 3) lie in ``roi``, xmin xmax ymin ymax zmin zmax; None: all."""
     if roi is None:
         return np.ones(len(points), dtype=bool)
     keep = np.ones(len(points), dtype=bool)

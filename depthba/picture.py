@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 CELL_SPACINGS = 4.0
-"""Cells of the spread are this many point spacings wide: enough points for a mean, small enough for slopes."""
+"""Width of a cell in point spacings: enough points for a mean, small enough for slopes."""
 EMPTY, DARK = "#e9e9ec", "#121212"
 SPREADS = "inferno_r"
 HEIGHTS = (
@@ -58,7 +58,7 @@ class Spreads:
 def spreads(
     result: Result, dataset: Dataset, clouds: Sequence[FrameCloud], roi: Sequence[float] | None
 ) -> Spreads:
-    """Compare the frames cell by cell, in the map frame, at the start poses and at the estimated ones."""
+    """Compare the frames cell by cell, in the map frame, at the start and the estimated poses."""
     cell = CELL_SPACINGS * point_spacing(dataset, [c.points for c in clouds])
     T_map_world = result.depth_map.T_map_world
 
@@ -75,12 +75,12 @@ def spreads(
 def map_picture(
     result: Result,
     dataset: Dataset,
-    path: str | os.PathLike[str],
+    path: str | Path,
     *,
     options: Options | None = None,
     clouds: Sequence[FrameCloud] | None = None,
 ) -> None:
-    """Draw map.png: above the map before and after, below the spread between frames before and after.
+    """Draw map.png: the map before and after, and below it the spread between frames.
 
     Args:
         result: what to draw.
@@ -125,7 +125,7 @@ def map_picture(
 def before_after(
     result: Result,
     dataset: Dataset,
-    path: str | os.PathLike[str],
+    path: str | Path,
     *,
     options: Options | None = None,
     clouds: Sequence[FrameCloud] | None = None,
@@ -162,7 +162,7 @@ def before_after(
 
 
 def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
-    """Return the spread alone as PNG, from above, with colours up to ``top`` mm, for a dark ground."""
+    """Return the spread alone as PNG for a dark ground, with colours up to ``top`` mm."""
     from matplotlib import style
 
     box = _extent(depth_map)
@@ -182,7 +182,7 @@ def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
 def height_colours(
     heights: Floats, low: float | None = None, high: float | None = None
 ) -> NDArray[np.uint8]:
-    """Return (..., 3) colours for ``heights``, from ``low`` to ``high`` m; by default 2 % to 98 % of them."""
+    """Return (..., 3) colours from ``low`` to ``high`` m, by default 2 % and 98 % of the heights."""
     known = heights[np.isfinite(heights)]
     if not len(known):
         return np.full((*heights.shape, 3), 230, np.uint8)
@@ -191,13 +191,13 @@ def height_colours(
     level = np.clip((heights - low) / max(high - low, 1e-12), 0.0, 1.0)
     stops = np.linspace(0.0, 1.0, len(HEIGHTS))
     rgb = [np.interp(np.nan_to_num(level), stops, channel) for channel in np.transpose(HEIGHTS)]
-    return np.rint(np.stack(rgb, axis=-1)).astype(np.uint8)
+    return np.asarray(np.rint(np.stack(rgb, axis=-1)), dtype=np.uint8)
 
 
 def shade(heights: Floats, spacing: float) -> Floats:
-    """Return (ny, nx) brightness, 1 on level ground, of a surface lit from the upper left; NaN stays NaN.
+    """Return (ny, nx) brightness, 1 on level ground, of a surface lit from the upper left.
 
-    The slopes are stretched until half of them are steep enough to be seen.
+    The slopes are stretched until half of them are steep enough to be seen. NaN stays NaN.
     """
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
@@ -218,11 +218,12 @@ def shade(heights: Floats, spacing: float) -> Floats:
 
 
 def relief_image(depth_map: DepthMap, low: float, high: float) -> NDArray[np.uint8]:
-    """Return the map as shaded relief, (ny, nx, 4) red green blue alpha, transparent where unseen."""
+    """Return the map as shaded relief, (ny, nx, 4) RGB and alpha, transparent where unseen."""
     colours = height_colours(depth_map.heights, low, high).astype(float)
     light = np.nan_to_num(shade(depth_map.heights, depth_map.spacing))[..., None]
     alpha = 255.0 * np.isfinite(depth_map.heights)[..., None]
-    return np.rint(np.concatenate([np.clip(colours * light, 0, 255), alpha], -1)).astype(np.uint8)
+    rgba = np.concatenate([np.clip(colours * light, 0.0, 255.0), alpha], axis=-1)
+    return np.asarray(np.rint(rgba), dtype=np.uint8)
 
 
 def millimetres(metres: float) -> str:
@@ -244,7 +245,7 @@ def _figure(width: float, height: float, ground: str = "white") -> Figure:
     return figure
 
 
-def _save(figure: Figure, path: str | os.PathLike[str], dpi: int) -> None:
+def _save(figure: Figure, path: str | Path, dpi: int) -> None:
     """Write the figure as PNG, whole or not at all."""
     durable.write_bytes(path, _png(figure, dpi))
 
@@ -271,7 +272,7 @@ def _extent(depth_map: DepthMap) -> tuple[float, float, float, float]:
 
 
 def _height_range(result: Result) -> tuple[float, float]:
-    """Return the heights that the colours span in both maps, so that equal colours are equal heights."""
+    """Return the heights that the colours span, in both maps alike."""
     known = result.depth_map.heights[np.isfinite(result.depth_map.heights)]
     if not len(known):
         return 0.0, 1.0

@@ -1,4 +1,4 @@
-"""A run on disk: what a registration leaves behind, written whole or not at all, and how to read it again.
+"""A run on disk: what a registration leaves behind, each file whole or not at all.
 
 The plain files are the archive; the recording that may stand beside them is for looking.
 """
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 LOGS = Path("logs")
 LATEST = "latest"
 CLOUD_POINTS = 1_500_000
-"""More than this many points in cloud.ply are thinned further: 15 bytes each, so it stays below 25 MB."""
+"""Most points in cloud.ply, 15 bytes each; where there are more they are thinned."""
 
 
 def default_path(name: str, logs: Path = LOGS) -> Path:
@@ -250,7 +250,7 @@ def versions() -> dict[str, str]:
 
 
 def _plain(value: Any) -> Any:
-    """Turn arrays, tuples and NumPy scalars into what JSON and YAML hold; what is not finite into None."""
+    """Turn arrays, tuples and NumPy scalars into what JSON and YAML hold; NaN into None."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -329,7 +329,7 @@ class Run:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Read result.json of the run folder ``path``; it is written last, so without it there is no run.
+    """Read result.json of a run folder; it is written last, so without it there is no run.
 
     Raises:
         RunError: it is missing or not one of ours.

@@ -1,4 +1,4 @@
-"""How well frames agree where they overlap: the spread of their heights, cell by cell. Needs no truth."""
+"""How well frames agree: the spread of their heights, cell by cell. Needs no truth."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class CellSpread:
     views: NDArray[np.int64]
     """(m,), number of frames that see the cell."""
     spread: Floats
-    """(m,), 1.4826 x median absolute deviation of the frames' heights, metres; NaN below two views."""
+    """(m,), 1.4826 x median absolute deviation of the heights, metres; NaN below two views."""
 
     @property
     def shared(self) -> Floats:
@@ -48,11 +48,11 @@ class CellSpread:
         return np.asarray(self.spread[self.views >= 2])
 
     def quantile(self, q: float) -> float:
-        """Return quantile ``q`` in 0..1 of the spread over shared cells, metres; NaN without such cells."""
+        """Return quantile ``q`` in 0..1 of the shared cells' spread, metres; NaN without such."""
         return float(np.quantile(self.shared, q)) if len(self.shared) else float("nan")
 
     def image(self) -> Floats:
-        """Return the spread as an image, (ny, nx) in metres, NaN where fewer than two frames see the cell."""
+        """Return the spread as (ny, nx), metres; NaN where fewer than two frames see the cell."""
         ny, nx = self.shape
         flat = np.full(nx * ny, np.nan)
         flat[self.seen] = self.spread
@@ -103,7 +103,7 @@ def _cell_heights(p: Floats, low: Floats, cell: float, ny: int) -> CellHeights:
 def _robust_spread(
     cells: NDArray[np.int64], heights: Floats
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-    """Return the cells, their numbers of entries and 1.4826 x the median absolute deviation in each."""
+    """Return the cells, their numbers of entries and the spread of each."""
     seen, first, views = np.unique(np.sort(cells), return_index=True, return_counts=True)
     group = np.repeat(np.arange(len(seen)), views)
     heights = heights[np.argsort(cells, kind="stable")]

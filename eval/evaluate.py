@@ -66,7 +66,7 @@ def evaluate(
         cell: edge of the cells in which frames are compared, m; None: four point spacings.
 
     Returns:
-        The metrics of the estimate, then those of the start poses, whose names begin with ``start_``.
+        The metrics of the estimate, then those of the start poses, named ``start_...``.
 
     Raises:
         RunError: the run or its dataset is missing, or they do not belong together.
@@ -164,7 +164,7 @@ def judge(
 
 
 def as_json(judged: Evaluation) -> dict[str, Any]:
-    """Return what metrics.json holds: name to value, unit and direction; a value that is unknown is null."""
+    """Return what metrics.json holds: name to value, unit, direction; unknown values are null."""
 
     def figures(metrics: Sequence[Metric]) -> dict[str, Any]:
         return {
@@ -195,9 +195,9 @@ def _open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
     """Open the dataset of a run, or the one given in its place."""
     if path is None and not run.dataset_path.is_dir():
         raise RunError(
-            f"{run.path}: its dataset {run.dataset_path} is not there; say with --dataset where it is"
+            f"{run.path}: its dataset {run.dataset_path} is not there; say where with --dataset"
         )
-    return Dataset.open(run.dataset_path if path is None else path)
+    return Dataset.open(run.dataset_path if path is None else Path(path))
 
 
 def _match(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np.int64]:

@@ -1,7 +1,7 @@
 """Errors of estimated poses against true ones, with their units.
 
-Poses are ``T_world_camera``; an error is a left perturbation about the camera centre, in world axes:
-``t_est - t_true`` in metres and ``log(R_est R_true^T)`` in radians.
+Poses are ``T_world_camera``. An error is a left perturbation about the camera centre, in world
+axes: ``t_est - t_true`` in metres and ``log(R_est R_true^T)`` in radians.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def pose_metrics(T_est: Floats, T_true: Floats) -> list[Metric]:
         T_true: (N, 4, 4).
 
     Returns:
-        Mean absolute error, root mean square and largest magnitude over the axes of frames 1 and on, the first two per
-        axis as well; the absolute trajectory error after the best rigid alignment; the relative pose error
-        between consecutive frames.
+        Mean absolute error, root mean square and largest magnitude over frames 1 and on, the
+        first two per axis as well; the trajectory error after the best rigid alignment; the
+        relative pose error between consecutive frames.
 
     """
     errors = pose_errors(se3.align_first(T_est, T_true), T_true)[1:]
@@ -78,7 +78,8 @@ def pose_metrics(T_est: Floats, T_true: Floats) -> list[Metric]:
 def rigid_alignment(points: Floats, onto: Floats) -> tuple[Floats, Floats]:
     """Return R (3, 3) and t (3,) that minimise ``|R p + t - q|`` over pairs of points (n, 3).
 
-    Umeyama, Least-squares estimation of transformation parameters between two point patterns (1991), without scale.
+    Umeyama, Least-squares estimation of transformation parameters between two point patterns
+    (1991), without scale.
     """
     p0, q0 = points.mean(axis=0), onto.mean(axis=0)
     U, _, Vt = np.linalg.svd((onto - q0).T @ (points - p0))
@@ -94,7 +95,7 @@ def absolute_trajectory_error(T_est: Floats, T_true: Floats) -> float:
 
 
 def relative_pose_error(T_est: Floats, T_true: Floats) -> tuple[float, float]:
-    """Return root mean squares of the error of motion between consecutive frames: metres and radians."""
+    """Return root mean square errors of the motion from frame to frame, metres and radians."""
     if len(T_est) < 2:
         return float("nan"), float("nan")
     moved_est = se3.inverse(T_est[:-1]) @ T_est[1:]
@@ -109,7 +110,7 @@ class Consistency:
     """Whether the errors are as large as the covariance says."""
 
     nees_per_dof: float
-    """Normalised estimation error squared per degree of freedom; about 1 when the covariance is honest."""
+    """Normalised estimation error squared per degree of freedom: 1 is an honest covariance."""
     dof: int
     """Degrees of freedom that were judged: 6N - 6, less directions that have no variance."""
 
@@ -120,8 +121,9 @@ def consistency(T_est: Floats, T_true: Floats, covariance: Floats) -> Consistenc
     Args:
         T_est: (N, 4, 4).
         T_true: (N, 4, 4).
-        covariance: (6N, 6N), translation then rotation per frame, world axes of the estimate, left perturbation
-            about the camera centre. Frame 0 may be certain (zeros) or not: what counts is relative to it.
+        covariance: (6N, 6N), translation then rotation per frame, world axes of the estimate,
+            left perturbation about the camera centre. Frame 0 may be certain (zeros) or not: what
+            counts is relative to it.
 
     """
     n = len(T_est)
@@ -157,7 +159,7 @@ def start(metrics: Sequence[Metric]) -> list[Metric]:
 
 
 def split(metrics: Sequence[Metric]) -> tuple[list[Metric], list[Metric]]:
-    """Undo `start`: return the metrics of the estimate and those of the start poses, by one name."""
+    """Undo `start`: return the metrics of the estimate and those of the start poses."""
     estimate = [m for m in metrics if not m.name.startswith(START)]
     before = [
         Metric(m.name.removeprefix(START), m.unit, m.better, m.value)

@@ -1,4 +1,4 @@
-"""The depth map as a recording shows it: a thinned mesh and a small picture, only when it changed."""
+"""The depth map as a recording shows it: a thinned mesh and a small picture."""
 
 from __future__ import annotations
 

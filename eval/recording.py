@@ -167,9 +167,9 @@ class Recorder:
             rec.log(f"before/{i}/points", shown, static=True)
             self._frustum(f"cam/{i}", i, p)
             self._frustum(f"before/{i}", i, p)
-        names = {**CURVES}
-        for i, colour in enumerate(self._colours):
-            names[f"residual/{i}"] = (f"frame {i}", tuple(int(c) for c in colour))
+        names = dict(CURVES)
+        for i, (r, g, b) in enumerate(self._colours.tolist()):
+            names[f"residual/{i}"] = (f"frame {i}", (r, g, b))
         for path, (name, rgb) in names.items():
             rec.log(path, rr.SeriesLines(names=name, colors=rgb), static=True)
         if self._true is not None:
@@ -220,8 +220,8 @@ class Recorder:
         both = spreads(result, self._dataset, self._clouds, self._options.roi)
         for name, spread in (("before", both.before), ("after", both.after)):
             picture = spread_png(spread, result.depth_map, both.top)
-            shown = rr.EncodedImage(contents=picture, media_type="image/png")
-            rec.log(f"spread/{name}", shown, static=True)
+            image = rr.EncodedImage(contents=picture, media_type="image/png")
+            rec.log(f"spread/{name}", image, static=True)
 
     def _centres(
         self, path: str, centres: Floats, colour: tuple[int, int, int], label: str
@@ -281,7 +281,7 @@ def _log_figures(
     """Record the metrics, as a page and as properties."""
     page = rr.TextDocument(figures_page(run, metrics), media_type="text/markdown")
     rec.log("figures", page, static=True)
-    values = {m.name: m.value for m in metrics if np.isfinite(m.value)}
+    values: dict[str, Any] = {m.name: m.value for m in metrics if np.isfinite(m.value)}
     if values:
         rec.send_property("metrics", rr.AnyValues(**values))
 

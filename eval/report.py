@@ -41,6 +41,9 @@ SHORT_NAMES = {
 }
 """The same for where there is little room."""
 
+MOST_LINES = 6
+"""Of what is open or held, on a page with little room."""
+
 VERDICTS = {
     "converged": "Converged",
     "not_converged": "Not to be trusted: not converged",
@@ -50,7 +53,7 @@ VERDICTS = {
 
 
 def report(judged: Evaluation) -> str:
-    """Return report.md: verdict, figures before and after, the picture, weak directions, frames, how it was run."""
+    """Return report.md: verdict, figures, picture, what is weak, the frames, how it was run."""
     run = judged.run.result
     parts = [
         f"# {judged.run.name}",
@@ -92,9 +95,12 @@ def figures_page(run: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     else:
         parts.append("Not judged yet: `depthba evaluate` adds the figures.")
     open_ones = [
-        f"- frame {w['frame']} is held by its measured pose along {w['name']}" for w in run["weak"]
+        f"- frame {w['frame']} is held along {w['name']} by its measured pose" for w in run["weak"]
     ]
     open_ones += [f"- frame {f['frame']} is held: {f['held']}" for f in _held(run["frames"])]
+    if len(open_ones) > MOST_LINES:
+        more = len(open_ones) - MOST_LINES
+        open_ones = [*open_ones[:MOST_LINES], f"- and {more} more, see report.md"]
     if open_ones:
         parts.append("\n".join(open_ones))
     seconds = run["seconds"].get("total", sum(run["seconds"].values()))
@@ -124,7 +130,7 @@ def _verdict(run: Mapping[str, Any]) -> str:
 
 
 def show(metric: Metric) -> str:
-    """Return a metric's value for people, three digits: millimetres, milliradians or a bare number."""
+    """Return a value for people, three digits: millimetres, milliradians or a bare number."""
     unit = {"m": " mm", "rad": " mrad", "1": ""}[metric.unit]
     value = metric.value if metric.unit == "1" else 1e3 * metric.value
     return "unknown" if not np.isfinite(value) else f"{three_digits(value)}{unit}"

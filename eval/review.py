@@ -60,7 +60,7 @@ def viewer() -> Path:
 
     """
     try:
-        import rerun_cli
+        import rerun_cli  # type: ignore[import-untyped]
     except ImportError:
         raise MissingPackage("rerun-sdk is not installed: pip install 'depthba[eval]'") from None
     name = "rerun.exe" if sys.platform == "win32" else "rerun"

@@ -37,7 +37,7 @@ class Agreement:
 
     spread: CellSpread
     pairs: tuple[tuple[int, int, float], ...]
-    """Overlapping pairs: indices i < j of the frames and the median point-to-plane distance, metres."""
+    """Overlapping pairs: indices i < j and the median point-to-plane distance, metres."""
 
     def metrics(self) -> list[Metric]:
         """Return spread and point-to-plane distance as metrics."""
@@ -87,7 +87,7 @@ def agreement(
 def _point_to_plane(
     world: Sequence[Floats], cells: Sequence[NDArray[np.int64]], cell: float
 ) -> tuple[tuple[int, int, float], ...]:
-    """Compare every pair of overlapping frames: median distance of one's points from the other's planes."""
+    """Compare all overlapping pairs: median distance of one's points from the other's planes."""
     surfaces = [_Surface(p, cell) for p in world]
     pairs = []
     for j, target in enumerate(surfaces):
@@ -116,7 +116,7 @@ class _Surface:
         return self.points[:: max(1, len(self.points) // SAMPLES)]
 
     def distances(self, points: Floats, reach: float) -> Floats:
-        """Return distances of ``points`` from the plane at their nearest point, where that is within ``reach``."""
+        """Return distances from the plane at the nearest point, where that is in ``reach``."""
         distance, nearest = self._tree.query(points, distance_upper_bound=reach, workers=-1)
         near = np.isfinite(distance)
         at = nearest[near]
