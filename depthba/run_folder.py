@@ -25,7 +25,7 @@ from depthba import durable, trajectory
 from depthba.clouds import FrameCloud, inside, load_clouds, thin, transform
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
-from depthba.errors import RunError
+from depthba.errors import DatasetError, RunError
 from depthba.options import Options
 from depthba.ply import write_ply
 from depthba.result import Iteration, Result
@@ -264,6 +264,10 @@ def _plain(value: Any) -> Any:
     return value
 
 
+BROKEN = (OSError, KeyError, ValueError, zipfile.BadZipFile, yaml.YAMLError, DatasetError)
+"""What reading the files of a broken run raises."""
+
+
 @dataclass(frozen=True)
 class Run:
     """A run as its folder holds it."""
@@ -324,7 +328,7 @@ class Run:
                 depth_map_start=read_map(map_start) if map_start.exists() else None,
                 dataset_path=Path(result["dataset"]["path"]),
             )
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile, yaml.YAMLError) as error:
+        except BROKEN as error:
             raise RunError(f"{path}: not a whole run folder: {error}") from error
 
 

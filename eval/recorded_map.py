@@ -21,6 +21,8 @@ MESH_NODES = 9_000
 PICTURE_SIDE = 360
 FINAL_SIDE = 1200
 """Largest side of the picture from above, pixels."""
+MESH_BYTES = 9_000_000
+"""Once the meshes take so much, only the first of each grid and the last are recorded."""
 VISIBLE = 0.002
 """Changes below this share of the map's height range are not recorded again."""
 GROUND = (233, 233, 236)
@@ -35,6 +37,7 @@ class RecordedMap:
         self._shown: Floats = np.zeros((0, 0))
         self._known: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._range: tuple[float, float] | None = None
+        self._bytes = 0
 
     def log(self, rec: rr.RecordingStream, depth_map: DepthMap, *, final: bool = False) -> None:
         """Record the map at the stream's present time, unless it looks as it did before.
@@ -56,8 +59,10 @@ class RecordedMap:
         grid = (depth_map.shape, depth_map.origin, depth_map.spacing)
         same_grid = grid == self._grid and np.mean(known != self._known) < 0.01
         span = max(self._range[1] - self._range[0], 1e-9)
-        if same_grid and not final and np.mean(np.abs(filled - self._shown)) < VISIBLE * span:
-            return
+        if same_grid and not final:
+            changed = float(np.mean(np.abs(filled - self._shown)))
+            if changed < VISIBLE * span or self._bytes > MESH_BYTES:
+                return
         step = int(np.ceil(np.sqrt(heights.size / (MESH_NODES * (4 if final else 1)))))
         self._mesh(rec, depth_map, filled, step, same_grid and not final)
         side = FINAL_SIDE if final else PICTURE_SIDE
@@ -86,6 +91,7 @@ class RecordedMap:
         )
         vertices = thin.vertices().reshape(-1, 3).astype(np.float32)
         colours = relief_image(thin, *self._range).reshape(-1, 4)
+        self._bytes += vertices.nbytes + colours.nbytes
         if same_triangles:
             rec.log(
                 "map/surface",
