@@ -17,7 +17,7 @@ from depthba.durable import write_json, write_text
 from depthba.errors import DatasetError, OptionError
 from sim.engine import mujoco
 from sim.markers import discs_of, observe
-from sim.noise import choose_stages, measure
+from sim.noise import Shot, choose_stages, measure
 from sim.raycast import RayScene
 from sim.rigs import Track, find_rig
 from sim.scenes import Scene, find_scene
@@ -98,10 +98,11 @@ def generate(
     seen: dict[str, list[tuple[int, Array]]] = {disc.name: [] for disc in discs}
 
     camera, total = sensor.camera, len(track.stamps)
+    shot = Shot(sensor, camera.rays())
     for k in range(total):
         T_true = track.T_world_camera_true[k]
         hits = scene_rays.view(camera, T_true)
-        depth = measure(hits.distance, sensor, options.seed, k, stages)
+        depth = measure(hits.distance, shot, options.seed, k, stages)
         for disc in discs:
             p_camera = observe(disc, camera, T_true, hits, depth)
             if p_camera is not None:

@@ -96,10 +96,9 @@ def choose_stages(clean: bool = False, without: tuple[str, ...] = ()) -> tuple[S
 
 
 def measure(
-    depth: Array, sensor: DepthSensor, seed: int, frame: int, stages: tuple[Stage, ...] = STAGES
+    depth: Array, shot: Shot, seed: int, frame: int, stages: tuple[Stage, ...] = STAGES
 ) -> Array:
     """What the sensor reports of the exact depth (height, width) m of a frame; NaN: nothing."""
-    shot = Shot(sensor, sensor.camera.rays())
     for stage in stages:
         depth = stage(depth, shot, stream(seed, "noise", stage.name, frame))
     return depth

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from depthba.camera import Camera
 from sim.engine import mujoco
-from sim.raycast import Hits, RayScene
+from sim.raycast import Hits, RayScene, world_rays
 from sim.seeds import stream
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Painter:
         """The colour image (height, width, 3) uint8 RGB that belongs to the hits of a view."""
         seen = np.flatnonzero(hits.triangle.ravel() >= 0)
         triangle = hits.triangle.ravel()[seen]
-        directions = camera.rays().reshape(-1, 3)[seen] @ T_world_camera[:3, :3].T
+        directions = world_rays(camera, T_world_camera).reshape(-1, 3)[seen]
         points = T_world_camera[:3, 3] + directions * hits.distance.ravel()[seen, None]
         lit = np.flatnonzero(self._lit[triangle])
         # A millimetre off the surface, so that it does not shade itself.
