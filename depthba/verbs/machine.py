@@ -163,7 +163,7 @@ def _port(port: int, use: str) -> Check:
 def _memory() -> Check:
     try:
         pages = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_AVPHYS_PAGES")
-    except (ValueError, OSError):
+    except (AttributeError, ValueError, OSError):
         return Check("memory", False, "this system does not say")
     total, free = (count * os.sysconf("SC_PAGE_SIZE") / 2**30 for count in pages)
     return Check("memory", total > 3.0, f"{free:.1f} of {total:.1f} GiB free")
