@@ -72,7 +72,7 @@ class Gantry:
     The image's long side lies along world y. A row of frames runs along x, the next one back.
     """
 
-    x: tuple[float, float] = (0.2, 6.8)
+    x: tuple[float, float] = (0.0, 7.0)
     y: tuple[float, float] = (1.0, 5.0)
     """First and last position, m."""
     height: float = 3.0

@@ -37,7 +37,8 @@ class Arguments:
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
     """Image size in pixels, such as 320x240. None: the sensor's own."""
     start_error: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="M RAD")] = None
-    """Instead of the rig's pose errors: independent Gaussian errors per axis; frame 0 is exact."""
+    """Instead of the rig's pose errors: independent Gaussian errors per axis with these standard
+    deviations, m and rad; frame 0 is exact."""
     clean: bool = False
     """Leave all noise out, of the depth and of the poses; --start-error still counts."""
     pose_noise: float = 1.0
