@@ -78,8 +78,10 @@ class RunFolder:
         except OSError as error:
             raise RunError(f"{path}: cannot make the folder: {error.strerror}") from error
         if overwrite:
-            for name in ("metrics.json", "report.md", "run.rrd"):  # they speak of the earlier run
-                (path / name).unlink(missing_ok=True)
+            # these speak of the earlier run, or are what a crash left of it
+            stale = [path / name for name in ("metrics.json", "report.md", "run.rrd")]
+            for file in [*stale, *path.glob(f".*{durable.PART}")]:
+                file.unlink(missing_ok=True)
         return cls(path)
 
     def write(self, result: Result, options: Options, dataset: Dataset) -> None:

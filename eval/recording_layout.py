@@ -14,7 +14,7 @@ from depthba.depth_map import DepthMap
 Floats = NDArray[np.float64]
 
 BACKGROUND = (24, 26, 30)
-TAN_HALF_VIEW = 0.42
+TAN_HALF_VIEW = 0.55
 """Tangent of half the angle that the viewer's eye takes in, in height."""
 
 
@@ -37,7 +37,7 @@ def blueprint(depth_map: DepthMap, T_world_camera: Floats, *, truth: bool) -> rr
     """Arrange the views: before on the left, after in the middle, figures and map on the right.
 
     Args:
-        depth_map: the final map, (4, 4) axes and extent of which say where to look from.
+        depth_map: the final map, whose axes and extent say where to look from.
         T_world_camera: (N, 4, 4), the final poses, which should be seen.
         truth: whether there are curves of errors.
 
@@ -73,26 +73,29 @@ def blueprint(depth_map: DepthMap, T_world_camera: Floats, *, truth: bool) -> rr
     told = rrb.Vertical(
         rrb.TextDocumentView(origin="/figures", name="Figures"),
         rrb.Tabs(
-            _scene("Map", ["/map/surface"], depth_map, np.zeros((0, 3))),
+            _scene("Map", ["/map/surface"], depth_map, np.zeros((0, 3)), wide=2.2),
             _above("Map from above", "/map/picture"),
         ),
         rrb.Tabs(*curves, active_tab=0),
-        row_shares=[5, 4, 4],
+        row_shares=[6, 4, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(before, after, told, column_shares=[5, 5, 5]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="iteration", play_state="following"),
+        rrb.TimePanel(state="collapsed", timeline="iteration", fps=4.0, play_state="following"),
         auto_views=False,
         auto_layout=False,
     )
 
 
 def _scene(
-    name: str, contents: list[str], depth_map: DepthMap, centres: Floats
+    name: str, contents: list[str], depth_map: DepthMap, centres: Floats, wide: float = 1.1
 ) -> rrb.Spatial3DView:
-    """Return a view from above and in front, from where the map and the cameras are all seen."""
+    """Return a view from above and in front, from where the map and the cameras are all seen.
+
+    The pane is about ``wide`` times as wide as it is high.
+    """
     vertices = depth_map.vertices().reshape(-1, 3)
     vertices = vertices[np.isfinite(vertices).all(axis=1)]
     if not len(vertices):
@@ -103,7 +106,7 @@ def _scene(
     target = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     # the nearest place on that line from which every point lies within the view's angle
     depth, side, rise = ((seen - target) @ axis for axis in (back, across, np.cross(back, across)))
-    distance = 1.08 * np.max(depth + np.maximum(np.abs(side), np.abs(rise)) / TAN_HALF_VIEW)
+    distance = 1.08 * np.max(depth + np.maximum(np.abs(side) / wide, np.abs(rise)) / TAN_HALF_VIEW)
     return rrb.Spatial3DView(
         origin="/",
         contents=contents,

@@ -83,7 +83,7 @@ def figures_page(run: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
         metrics: as `eval.evaluate.evaluate` returns them, or none.
 
     """
-    parts = [f"## {run['name']}", _verdict(run)]
+    parts = [f"### {run['name']}", _verdict(run)]
     if metrics:
         estimate, before = ({m.name: m for m in ms} for ms in split(metrics))
         rows = [
