@@ -19,7 +19,7 @@ from depthba.verbs.output import angle, length, note, print_json
 
 if TYPE_CHECKING:
     from depthba.dataset import Dataset
-    from depthba.result import Iteration, Result
+    from depthba.result import FrameReport, Iteration, Result
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def register_into(
     out: Path | None = None,
     overwrite: bool = False,
     evaluate: bool = False,
+    record: bool = True,
 ) -> Outcome:
     """Register a dataset into a run folder, with progress on stderr and a recording.
 
@@ -85,6 +86,7 @@ def register_into(
         out: the run folder; None takes a new one in logs/.
         overwrite: whether the folder may hold an earlier run.
         evaluate: judge the run too, so that the recording shows the figures.
+        record: make a recording.
 
     Raises:
         DepthbaError: the dataset, the options or the folder do not do. A folder that was
@@ -98,7 +100,7 @@ def register_into(
     with removed_on_failure(path, overwrite):
         folder = RunFolder.create(path, overwrite=overwrite)
         with (
-            _recorder(path / "run.rrd", dataset, options) as recorder,
+            _recorder(path / "run.rrd", dataset, options, record) as recorder,
             RegistrationProgress(dataset.name) as progress,
         ):
             callback = _Callback(progress, recorder)
@@ -142,9 +144,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             }
             for weak in result.weak
         ],
-        "held": [
-            {"frame": frame.frame, "why": frame.held} for frame in result.frames if frame.held
-        ],
+        "held": [{"frame": frame.frame, "why": frame.held} for frame in _held(result)],
         "run": str(outcome.run),
         "recording": None if outcome.recording is None else str(outcome.recording),
     }
@@ -177,13 +177,18 @@ def report(name: str, outcome: Outcome, most: int = 6) -> list[str]:
         ],
         most,
     )
-    held = [f"frame {frame.frame}: {frame.held}" for frame in result.frames if frame.held]
+    held = [f"frame {frame.frame}: {frame.held}" for frame in _held(result)]
     lines += _first("held", held, most)
     lines.append(f"  run           {outcome.run}")
     lines.append(f"  picture       {outcome.run / 'map.png'}")
     if outcome.recording is not None:
         lines.append(f"  recording     {outcome.recording}")
     return lines
+
+
+def _held(result: Result) -> list[FrameReport]:
+    """Return the frames that stayed where they began; the first does so always, and is left out."""
+    return [frame for frame in result.frames[1:] if frame.held]
 
 
 def _first(title: str, items: list[str], most: int) -> list[str]:
@@ -219,8 +224,11 @@ def removed_on_failure(path: Path, overwrite: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _recorder(path: Path, dataset: Dataset, options: Options) -> Iterator[Any]:
-    """Give a recorder from the package above; where that is missing, None and a note."""
+def _recorder(path: Path, dataset: Dataset, options: Options, wanted: bool) -> Iterator[Any]:
+    """Give a recorder from the package above; where it is not wanted or not there, None."""
+    if not wanted:
+        yield None
+        return
     try:
         recorder = importlib.import_module("eval.recording").Recorder(path, dataset, options)
     except ImportError as error:
