@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from depthba.verbs import DONE, WRONG_USAGE
+from depthba.verbs.output import note, print_json
 from eval.evaluate import Evaluation, as_json, save
 from eval.report import NAMES, VERDICTS, gain, show
 
@@ -20,7 +22,7 @@ class Arguments:
     Leaves metrics.json and report.md in every run folder.
     """
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
     """Run folders, as register leaves them."""
     dataset: Path | None = None
     """Folder of the dataset. None: the one that each run remembers."""
@@ -35,8 +37,8 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Evaluate every run and print the figures; return the exit status."""
     if not arguments.runs:
-        print("depthba evaluate: no run folder given, expected one or more", file=sys.stderr)
-        return 2
+        note("depthba evaluate: no run folder given, expected one or more")
+        return WRONG_USAGE
     judged = []
     for path in arguments.runs:
         one = save(path, arguments.dataset, arguments.truth, arguments.cell)
@@ -44,8 +46,8 @@ def run(arguments: Arguments) -> int:
         if not arguments.json:
             _print(one)
     if arguments.json:
-        print(json.dumps({"runs": [as_json(one) for one in judged]}))
-    return 0
+        print_json({"runs": [as_json(one) for one in judged]})
+    return DONE
 
 
 def _print(judged: Evaluation) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from depthba.verbs import DONE, WRONG_USAGE
+from depthba.verbs.output import note, print_json
 from eval import review
 
 
@@ -16,7 +17,7 @@ from eval import review
 class Arguments:
     """Open the recordings of runs in the Rerun viewer."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")] = ()
     """Run folders. None: the newest run, logs/latest."""
     web: bool = False
     """Serve to a browser, on 127.0.0.1 alone, in place of opening a window."""
@@ -31,13 +32,13 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Show the recordings; return the exit status."""
     if arguments.web and arguments.screenshot is not None:
-        print("depthba review: --web and --screenshot exclude each other", file=sys.stderr)
-        return 2
+        note("depthba review: --web and --screenshot exclude each other")
+        return WRONG_USAGE
     files = review.recordings(arguments.runs)
     if arguments.json:
         shot = arguments.screenshot
         told = {"recordings": [str(f) for f in files], "screenshot": str(shot) if shot else None}
-        print(json.dumps(told), flush=True)
+        print_json(told)
     if arguments.screenshot is not None:
         review.screenshot(files, arguments.screenshot)
         if not arguments.json:
@@ -46,4 +47,4 @@ def run(arguments: Arguments) -> int:
         review.serve(files, arguments.port)
     else:
         review.show(files)
-    return 0
+    return DONE
