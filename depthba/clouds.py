@@ -41,9 +41,11 @@ def load_clouds(dataset: Dataset, *, colours: bool = True) -> tuple[FrameCloud, 
         if camera is None:
             clouds.append(FrameCloud(np.asarray(frame.points(), dtype=float), None))
             continue
-        depth = frame.depth()
+        depth = frame.depth().astype(float)
+        if step := dataset.sensor.depth_scale:
+            depth = np.rint(depth / step) * step  # the digits that single precision cut
         measured = np.isfinite(depth) & (depth > 0)
-        points = camera.rays()[measured] * depth[measured].astype(float)[:, None]
+        points = camera.rays()[measured] * depth[measured][:, None]
         rgb = frame.rgb() if colours else None
         clouds.append(FrameCloud(points, None if rgb is None else rgb[measured]))
     return tuple(clouds)

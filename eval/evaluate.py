@@ -133,7 +133,7 @@ def judge(
             dof = judged.dof
 
     clouds = load_clouds(data, colours=False)
-    points = [clouds[k].points for k in rows]
+    points = [_within_range(data, clouds[k].points) for k in rows]
     if cell is None:
         cell = CELL_SPACINGS * point_spacing(data, points)
     reference = T_measured if T_true is None else T_true
@@ -216,6 +216,16 @@ def _match(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np
         worst = want[np.argmax(apart)]
         raise RunError(f"{wanted_by}: stamp {worst:.6f} s, expected one of the frames in {owner}")
     return np.asarray(nearest, dtype=np.int64)
+
+
+def _within_range(data: Dataset, points: Floats) -> Floats:
+    """Leave out the very ends of the range of a depth sensor, where sensors clip."""
+    sensor = data.sensor
+    if sensor.kind != "depth":
+        return points
+    low = 0.0 if sensor.depth_min is None else sensor.depth_min
+    high = np.inf if sensor.depth_max is None else sensor.depth_max
+    return points[(points[:, 2] > low) & (points[:, 2] < high)]
 
 
 def _truth(
