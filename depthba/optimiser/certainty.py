@@ -1,0 +1,213 @@
+"""What is known about the solution, and what is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, eigh
+
+from depthba.optimiser import eliminate, kernels
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, fronts_of, robust_sigma
+from depthba.optimiser.prior import PosePrior, about_pivot
+from depthba.optimiser.problem import BLOCKS, Problem
+from depthba.result import WeakDirection
+
+# A direction is weak when the measured pose holds more than this share of what is known about it.
+WEAK = 0.5
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How much less the points know than as many independent ones would."""
+
+    inflation: float
+    """Factor on the variance of the poses, at least 1."""
+    S: NDArray[np.float64]
+    """(6N, 6N), exact reduced matrix that it was measured with."""
+
+
+def correlation(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    lin: Linearisation,
+    prior: PosePrior,
+    free: NDArray[np.bool_],
+    workers: Workers,
+    tolerance: float = 1e-3,
+) -> Correlation:
+    """Measure by how much the residuals' correlation over the image inflates the variance of the poses.
+
+    Gradients are summed over blocks of the image, over all frames at once, since a fixed pattern is common to them
+    (cluster-robust variance, Liang & Zeger 1986). The same sums over as many random groups of points say what
+    independent residuals would give. Each gives a scatter of the estimate, ``V G V`` with ``V = (S + T P)^-1``; the
+    factor is the ratio of the two in units of the prior P, so that the directions count that the data hold least. The
+    prior's weight T depends on the factor in turn, which a few rounds settle.
+    """
+    S = eliminate.exact(lin, workers, tolerance)
+    keep = np.repeat(free, 6)
+    if not keep.any():
+        return Correlation(1.0, S)
+    inner = S[np.ix_(keep, keep)]
+    P = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])[np.ix_(keep, keep)]
+    count = BLOCKS[0] * BLOCKS[1]
+    rng = np.random.default_rng(0)
+    random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
+    scores = [
+        block_scores(problem, grid, state, loss, lin, blocks, workers)[:, keep]
+        for blocks in (tuple(f.blocks for f in problem.frames), random)
+    ]
+    scores = [s - s.mean(axis=0) for s in scores]
+    variance = robust_sigma(lin.residuals) ** 2
+    factor = 1.0
+    for _ in range(10):
+        V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
+        spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
+        factor = max(1.0, spread[0] / max(spread[1], 1e-300))
+    return Correlation(factor, S)
+
+
+def block_scores(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    lin: Linearisation,
+    blocks: tuple[NDArray[np.uint8], ...],
+    workers: Workers,
+    tolerance: float = 0.1,
+) -> NDArray[np.float64]:
+    """Return the reduced gradient of each block of points, (blocks, 6N): the map has answered to it."""
+    nodes = np.empty((*grid.shape, 3))
+    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
+    fronts = fronts_of(problem, state.T_map_camera)
+
+    def score(block: int) -> NDArray[np.float64]:
+        g, field = np.zeros((len(problem.frames), 6)), np.zeros(grid.shape)
+        for i, (frame, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True)):
+            kernels.block_gradient(
+                frame.points, T[:3, :3].copy(), T[:3, 3].copy(), T[:3, 3] - lin.pivots[i],
+                grid.origin, grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap,
+                lin.weights[i], blocks[i], block, g[i], field,
+            )  # fmt: skip
+        answer, _ = lin.C.solve(-field, tolerance)
+        return (g + eliminate.gather(lin, answer)).ravel()
+
+    return np.stack(workers.map(score, range(BLOCKS[0] * BLOCKS[1])))
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """Covariance of the poses and the directions that the data leave open."""
+
+    covariance: NDArray[np.float64]
+    """(6N, 6N), translation then rotation, world axes, about the camera centre."""
+    weak: tuple[WeakDirection, ...]
+
+
+def assess(
+    problem: Problem,
+    state: State,
+    lin: Linearisation,
+    S: NDArray[np.float64],
+    variance: float,
+    prior: PosePrior,
+    believed: bool,
+    free: NDArray[np.bool_],
+    frame_ids: tuple[int, ...],
+) -> Certainty:
+    """Turn the exact reduced matrix into covariances and a verdict on observability.
+
+    Args:
+        problem: the points.
+        state: the solution.
+        lin: its linearisation.
+        S: (6N, 6N) exact reduced matrix.
+        variance: m^2, of a residual, times its inflation.
+        prior: the measured poses; without belief in them they still judge which directions are weak.
+        believed: whether the prior took part in the solution.
+        free: (N,) frames that moved.
+        frame_ids: ids of the frames.
+    """
+    n = len(free)
+    keep = np.repeat(free, 6)
+    J = about_pivot(state.T_map_camera, lin.pivots)
+    data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
+    held = block_diag(*np.einsum("nji,njk,nkl->nil", J, prior.information, J))[np.ix_(keep, keep)]
+    posterior = np.linalg.inv(data + held)
+    weak = _weak_directions(posterior, held, free, frame_ids, problem)
+    about_pivots = np.zeros((6 * n, 6 * n))
+    # without belief in the prior a trace of it stays, so that open directions are large and not infinite
+    about_pivots[np.ix_(keep, keep)] = (
+        posterior if believed else np.linalg.inv(data + 1e-12 * held)
+    )
+    for i in np.flatnonzero(~free):
+        if prior.information[i].any():
+            inverse = np.linalg.inv(J[i])
+            about_pivots[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = (
+                inverse @ np.linalg.inv(prior.information[i]) @ inverse.T
+            )
+    turn = np.kron(np.eye(2), problem.T_map_world[:3, :3].T)
+    covariance = _both_sides(about_pivots, turn @ J)
+    return Certainty((covariance + covariance.T) / 2, weak)
+
+
+def _both_sides(M: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``J M J^T`` for block-diagonal J given as (N, 6, 6)."""
+    n = len(J)
+    rows = np.einsum("iab,ibjc->iajc", J, M.reshape(n, 6, n, 6))
+    return np.asarray(np.einsum("iajc,jdc->iajd", rows, J).reshape(6 * n, 6 * n))
+
+
+def _weak_directions(
+    posterior: NDArray[np.float64],
+    held: NDArray[np.float64],
+    free: NDArray[np.bool_],
+    frame_ids: tuple[int, ...],
+    problem: Problem,
+) -> tuple[WeakDirection, ...]:
+    """Find where a frame's posterior owes more to its measured pose than to the data.
+
+    In units of the prior a posterior variance lies between 0 (the data say all) and 1 (they say nothing). Directions
+    are taken about the frame's own centroid, where shift and turn are least alike.
+    """
+    weak = []
+    for k, i in enumerate(np.flatnonzero(free)):
+        window = slice(6 * k, 6 * k + 6)
+        believed = np.linalg.inv(held[window, window])
+        values, duals = eigh(posterior[window, window], believed)
+        lever = problem.frames[i].extent
+        for value, dual in zip(values[::-1], duals.T[::-1], strict=True):
+            if value <= WEAK:
+                break
+            one_sigma = believed @ dual * np.repeat([1.0, max(lever, 1e-9)], 3)
+            prior_sigma = float(np.linalg.norm(one_sigma))
+            share = min(float(value), 1 - 1e-9)
+            direction = one_sigma / prior_sigma
+            weak.append(
+                WeakDirection(
+                    frame=frame_ids[i],
+                    name=direction_name(direction),
+                    direction=direction,
+                    lever=lever,
+                    sigma=prior_sigma * float(np.sqrt(share / (1 - share))),
+                    prior_sigma=prior_sigma,
+                )
+            )
+    return tuple(weak)
+
+
+def direction_name(direction: NDArray[np.float64]) -> str:
+    """Name a unit direction (6,) for people, by its main parts: ``x``, ``turn about z``, ``0.8 x + 0.6 y``."""
+    names = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
+    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    order = [int(k) for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > 0.3]
+    if len(order) == 1:
+        return names[order[0]]
+    parts = [f"{abs(direction[k]):.1f} {names[k]}" for k in order]
+    signs = ["-" if direction[k] < 0 else "+" for k in order]
+    return parts[0] + "".join(f" {s} {p}" for s, p in zip(signs[1:], parts[1:], strict=True))

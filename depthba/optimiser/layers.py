@@ -1,0 +1,69 @@
+"""Cells that one height cannot describe: walls, edges, one thing above another. Their points count for less."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser import kernels
+from depthba.optimiser.grid import Grid, average, filled, make_grid
+from depthba.optimiser.problem import Problem
+
+# Scatter within a cell is measured on cells this many times the spacing of the points: fewer points say nothing.
+COARSEST = 3.0
+
+
+def down_weighted(
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float, usual: float
+) -> Problem:
+    """Return the problem with the points of rough cells taken for as noisy as they are, fixed for the level.
+
+    What one frame's points scatter about the averaged map within a cell is noise plus relief that the map cannot hold.
+    Up to ``usual`` times the typical scatter it is taken for noise; beyond, the point's noise grows with it. The weight
+    hangs on the point, not on the cell: one that changes cell keeps it, so nothing is gained by moving.
+    """
+    grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
+    rough = scatter(problem, T_map_camera, grid)
+    typical = float(np.median(rough[rough > 0])) if (rough > 0).any() else 0.0
+    if typical == 0.0:
+        return problem
+    factor = 1.0 / np.maximum(1.0, rough / (usual * typical))
+    frames = []
+    for frame, T in zip(problem.frames, T_map_camera, strict=True):
+        points = frame.points.copy()
+        points[:, 3] *= _look_up(factor, frame.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid)
+        frames.append(replace(frame, points=points))
+    return replace(problem, frames=tuple(frames))
+
+
+def scatter(
+    problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid
+) -> NDArray[np.float64]:
+    """Return (ny, nx) the standard deviation within a frame of heights about the averaged map, pooled over frames."""
+    nodes = np.empty((*grid.shape, 3))
+    kernels.nodal_gradients(
+        filled(average(problem, T_map_camera, grid).heights), grid.spacing, nodes
+    )
+    squares, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
+    for frame, T in zip(problem.frames, T_map_camera, strict=True):
+        total, square, count = (np.zeros(grid.shape) for _ in range(3))
+        kernels.splat_residuals(
+            frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes, total, square, count
+        )  # fmt: skip
+        several = count > 1
+        squares[several] += square[several] - total[several] ** 2 / count[several]
+        freedom[several] += count[several] - 1
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(freedom, 1.0)))
+
+
+def _look_up(
+    field: NDArray[np.float64], xy: NDArray[np.float64], grid: Grid
+) -> NDArray[np.float64]:
+    """Return the field's value at the node nearest to each point; 1 off the grid."""
+    k = np.rint((xy - grid.origin) / grid.spacing).astype(int)
+    on = ((k >= 0) & (k < [grid.shape[1], grid.shape[0]])).all(axis=1)
+    out = np.ones(len(xy))
+    out[on] = field[k[on, 1], k[on, 0]]
+    return out

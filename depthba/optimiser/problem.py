@@ -1,0 +1,240 @@
+"""What is registered: the points of every frame, and the map frame and extent they call for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import se3
+from depthba.camera import RangeNoise
+from depthba.dataset import Dataset, Sensor
+from depthba.errors import DatasetError, OptionError
+
+Roi = tuple[float, float, float, float, float, float]
+
+# Blocks of the image (columns, rows) over which residuals are taken to be correlated.
+BLOCKS = (8, 6)
+
+
+@dataclass(frozen=True)
+class FramePoints:
+    """The points of one frame, in the sensor frame."""
+
+    points: NDArray[np.float32]
+    """(n, 5): x, y, z in metres, the inverse of the point's noise relative to the typical one, and the share of its
+    cost that counts."""
+    blocks: NDArray[np.uint8]
+    """(n,), the block of the image that each point lies in."""
+    centroid: NDArray[np.float64]
+    """(3,), about which the frame is perturbed: its translation and rotation are then told apart."""
+    hull: NDArray[np.float64]
+    """(k, 3), extreme points: enough for the frame's bounds under any pose."""
+    extent: float
+    """Root mean square distance of the points from the centroid, m: the lever that compares rotation with shift."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def thinned(self, stride: int) -> FramePoints:
+        """Return every ``stride``-th point."""
+        if stride <= 1:
+            return self
+        return FramePoints(
+            np.ascontiguousarray(self.points[::stride]),
+            self.blocks[::stride],
+            self.centroid,
+            self.hull,
+            self.extent,
+        )
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Frames in one map frame. Poses here are ``T_map_camera``; frame 0 does not move."""
+
+    frames: tuple[FramePoints, ...]
+    T_map_camera: NDArray[np.float64]
+    """(N, 4, 4), the start."""
+    T_map_world: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    """(2,), lower x, y bounds of the points at the start poses, m."""
+    upper: NDArray[np.float64]
+    origin: bool
+    """Whether rays start at the origin of the sensor frame."""
+    spacing: float
+    """Typical distance of neighbouring points on the surface, m."""
+    noise: float | None
+    """Standard deviation of the range at a point of weight 1, m, where the dataset states it."""
+
+    def thinned(self, stride: int) -> Problem:
+        """Return the problem with every ``stride``-th point of each frame."""
+        return replace(self, frames=tuple(f.thinned(stride) for f in self.frames))
+
+    @property
+    def ranges(self) -> float:
+        """Typical distance from the sensor to the scene, m."""
+        return float(np.median([np.linalg.norm(f.centroid) for f in self.frames if len(f)]))
+
+
+def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | None) -> Problem:
+    """Read all points, choose the map frame, crop to the region of interest at the start poses.
+
+    Raises:
+        DatasetError: a file is damaged, or fewer than two frames have points.
+        OptionError: the region of interest holds no points.
+    """
+    if len(dataset) < 2:
+        raise DatasetError(
+            f"{dataset.path}: {len(dataset)} frame, but registration needs at least 2"
+        )
+    clouds = [frame.points() for frame in dataset]
+    if not any(len(p) for p in clouds):
+        raise DatasetError(f"{dataset.path}: no frame has a single valid depth")
+    T_map_world = choose_map_frame(dataset, clouds, T_world_camera)
+    T_map_camera = T_map_world @ T_world_camera
+    if roi is not None:
+        _check_roi(roi)
+        clouds = [_crop(p, T, roi) for p, T in zip(clouds, T_map_camera, strict=True)]
+        if not any(len(p) for p in clouds):
+            raise OptionError(f"--roi {' '.join(f'{v:g}' for v in roi)}: no point lies inside it")
+    if sum(len(p) > 0 for p in clouds) < 2:
+        seen = [f.id for f, p in zip(dataset, clouds, strict=True) if len(p)]
+        raise DatasetError(
+            f"{dataset.path}: only frame {seen[0]} has valid depth, but registration needs 2 or more"
+        )
+    sigmas = [_sigma(dataset.sensor.noise, p) for p in clouds]
+    typical = float(np.median(np.concatenate([s[:: max(1, len(s) // 2000)] for s in sigmas])))
+    frames = tuple(
+        _frame(p, typical / s, dataset.sensor) for p, s in zip(clouds, sigmas, strict=True)
+    )
+    lower, upper = _bounds(clouds, T_map_camera)
+    return Problem(
+        frames=frames,
+        T_map_camera=T_map_camera,
+        T_map_world=T_map_world,
+        lower=lower,
+        upper=upper,
+        origin=dataset.sensor.origin,
+        spacing=point_spacing(dataset.sensor, clouds),
+        noise=typical if dataset.sensor.noise is not None else None,
+    )
+
+
+def choose_map_frame(
+    dataset: Dataset, clouds: list[NDArray[np.float32]], T_world_camera: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return T_map_world: the world itself where the dataset says so, else a plane facing the sensors.
+
+    The z axis is the mean viewing direction reversed; where the sensors look in no common direction, the normal of
+    the plane fitted to all points, on the side of the sensors. The x axis stays as close to the world's as it can.
+    """
+    if dataset.map_frame == "world":
+        return np.eye(4)
+    z = -T_world_camera[:, :3, 2].mean(axis=0)
+    if np.linalg.norm(z) < 0.5:
+        world = np.concatenate(
+            [p[:: max(1, len(p) // 2000)] @ T[:3, :3].T + T[:3, 3] for p, T in zip(clouds, T_world_camera, strict=True)]
+        )  # fmt: skip
+        centred = world - world.mean(axis=0)
+        z = np.linalg.eigh(centred.T @ centred)[1][:, 0]
+        if z @ (T_world_camera[:, :3, 3].mean(axis=0) - world.mean(axis=0)) < 0:
+            z = -z
+    z = z / np.linalg.norm(z)
+    x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = x - z * (z @ x)
+    x /= np.linalg.norm(x)
+    return se3.make(np.stack([x, np.cross(z, x), z]), np.zeros(3))
+
+
+def point_spacing(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
+    """Typical distance of neighbouring points on a surface that faces the sensor, m."""
+    if sensor.camera is not None:
+        depth = float(np.median([np.median(p[:, 2]) for p in clouds if len(p)]))
+        return depth / float(np.sqrt(sensor.camera.fx * sensor.camera.fy))
+    from scipy.spatial import cKDTree
+
+    found = []
+    for p in clouds:
+        if len(p) > 1:
+            some = p[:: max(1, len(p) // 2000)]
+            found.append(np.median(cKDTree(p).query(some, k=2)[0][:, 1]))
+    return float(np.median(found))
+
+
+def _check_roi(roi: Roi) -> None:
+    for axis, low, high in zip("xyz", roi[0::2], roi[1::2], strict=True):
+        if not low < high:
+            raise OptionError(
+                f"--roi: {axis}min {low:g} is not below {axis}max {high:g} "
+                "(expected xmin xmax ymin ymax zmin zmax)"
+            )
+
+
+def _crop(
+    points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi
+) -> NDArray[np.float32]:
+    q = points @ T[:3, :3].T + T[:3, 3]
+    inside = ((q >= np.array(roi[0::2])) & (q <= np.array(roi[1::2]))).all(axis=1)
+    return np.ascontiguousarray(points[inside])
+
+
+def _sigma(noise: RangeNoise | None, points: NDArray[np.float32]) -> NDArray[np.float64]:
+    if noise is None:
+        return np.ones(len(points))
+    return np.asarray(noise.sigma(points[:, 2].astype(float)))
+
+
+def _frame(
+    points: NDArray[np.float32], weight: NDArray[np.float64], sensor: Sensor
+) -> FramePoints:
+    n = len(points)
+    if n == 0:
+        return FramePoints(
+            np.zeros((0, 5), np.float32), np.zeros(0, np.uint8), np.zeros(3), np.zeros((1, 3)), 0.0
+        )
+    weighted = np.ones((n, 5), np.float32)
+    weighted[:, :3] = points
+    weighted[:, 3] = weight
+    centroid = points.mean(axis=0, dtype=float)
+    extent = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
+    return FramePoints(weighted, _blocks(points, sensor), centroid, _extremes(points), extent)
+
+
+def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
+    """Return the image block of each point: over the sensor's image, or over the directions that a cloud spans."""
+    if sensor.camera is not None:
+        camera = sensor.camera
+        across = (points[:, 0] / points[:, 2] * camera.fx + camera.cx + 0.5) / camera.width
+        down = (points[:, 1] / points[:, 2] * camera.fy + camera.cy + 0.5) / camera.height
+    else:
+        spread = points[:, :2] - points[:, :2].min(axis=0)
+        across, down = (spread / np.maximum(spread.max(axis=0), 1e-9)).T
+    columns = np.clip((across * BLOCKS[0]).astype(int), 0, BLOCKS[0] - 1)
+    rows = np.clip((down * BLOCKS[1]).astype(int), 0, BLOCKS[1] - 1)
+    return (rows * BLOCKS[0] + columns).astype(np.uint8)
+
+
+def _extremes(points: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the extreme points along directions spread over the sphere (Fibonacci lattice)."""
+    n = 128
+    k = np.arange(n) + 0.5
+    height = 1 - 2 * k / n
+    angle = np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - height**2)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    some = points[:: max(1, len(points) // 20000)].astype(float)
+    return np.asarray(some[np.unique(np.argmax(some @ directions.T, axis=0))])
+
+
+def _bounds(
+    clouds: list[NDArray[np.float32]], T_map_camera: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Bounds of the points in x and y, less a handful of strays that would blow up the map."""
+    xy = np.concatenate(
+        [p[:: max(1, len(p) // 20000)] @ T[:2, :3].T + T[:2, 3] for p, T in zip(clouds, T_map_camera, strict=True)]
+    )  # fmt: skip
+    low, high = np.quantile(xy, [0.001, 0.999], axis=0)
+    reach = 0.1 * (high - low)
+    return np.maximum(xy.min(axis=0), low - reach), np.minimum(xy.max(axis=0), high + reach)

@@ -1,0 +1,150 @@
+"""Levenberg-Marquardt over poses and map on one grid.
+
+A step is judged on the whole cost, smoothing and priors included, at the robust scale where it was linearised and over
+all points: one that is not on the map pays for it, so nothing looks better by losing points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser import eliminate
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
+from depthba.optimiser.prior import PosePrior, move
+from depthba.optimiser.problem import Problem
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a level is solved."""
+
+    robust: float
+    """Scale of the Geman-McClure loss in robust standard deviations of the residuals; 0: no robust loss."""
+    limit: int
+    """Most iterations."""
+    settled: float = 0.1
+    """Converged when the step is below this many standard deviations of the poses (root mean square)."""
+    gain: float = 0.0
+    """Enough when a step lowers the cost by less than this share: a coarse level only has to bring the next into
+    reach."""
+    tolerance: float = 1e-2
+    """Relative residual at which the correction of the lumped step stops."""
+    outer: int = 12
+    """Most products with the exact reduced matrix in one step."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What one iteration did."""
+
+    state: State
+    lin: Linearisation
+    cost: float
+    step: eliminate.Step
+    damping: float
+    accepted: bool
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where a level ended."""
+
+    state: State
+    lin: Linearisation
+    loss: Loss
+    converged: bool
+    sigma: float
+
+
+def solve_map(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    smooth: NDArray[np.bool_],
+    workers: Workers,
+    rounds: int = 2,
+) -> tuple[State, Linearisation]:
+    """Solve the heights for given poses; return the state and the linearisation there."""
+    lin = linearise(problem, grid, state, loss, workers, smooth)
+    for _ in range(rounds):
+        answer, _ = lin.C.solve(-lin.g_map, 1e-6)
+        state = replace(state, heights=state.heights + answer)
+        lin = linearise(problem, grid, state, loss, workers, smooth)
+    return state, lin
+
+
+def solve_level(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    rules: Rules,
+    prior: PosePrior,
+    temperature: float,
+    free: NDArray[np.bool_],
+    smooth: NDArray[np.bool_],
+    workers: Workers,
+    report: Callable[[Progress], None],
+) -> Outcome:
+    """Iterate to convergence on one grid with one loss.
+
+    Args:
+        problem: the points.
+        grid: where the nodes stand.
+        state: where to start.
+        loss: the residual; its robust scale is set here as the residuals fall.
+        rules: how to iterate.
+        prior: the measured poses.
+        temperature: m^2, what a squared normalised prior error costs: the residuals' variance, times the factor by
+            which their correlation over the image exaggerates what they know.
+        free: (N,) frames that move.
+        smooth: (ny, nx) nodes under the smoothing term.
+        workers: the threads.
+        report: called after each iteration.
+    """
+    lin = linearise(problem, grid, state, replace(loss, robust_c=0.0), workers, smooth)
+    sigma = robust_sigma(lin.residuals)
+    loss = judge = _rescaled(loss, rules, sigma)
+    if rules.robust:
+        lin = linearise(problem, grid, state, loss, workers, smooth)
+    damping, converged = 0.0, False
+    dof = 6 * max(int(free.sum()), 1)
+    for _ in range(rules.limit):
+        matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
+        believed = temperature * matrix, temperature * gradient
+        step = eliminate.solve(lin, free, believed, damping, workers, rules.tolerance, rules.outer)
+        candidate = State(
+            move(state.T_map_camera, lin.pivots, step.pose), state.heights + step.map
+        )
+        after = linearise(problem, grid, candidate, loss, workers, smooth, judge)
+        before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
+        after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+        small = step.decrement < rules.settled**2 * dof * max(temperature, sigma**2, 1e-30)
+        # with the nodal gradient the cost may rise in the last digits while the poses still settle
+        accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6))
+        if accepted:
+            state, lin, judge = candidate, after, loss
+            sigma = robust_sigma(lin.residuals)
+            loss = _rescaled(loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma)
+            damping = damping / 10 if damping > 1e-6 else 0.0
+        else:
+            damping = max(10 * damping, 1e-4)
+        report(Progress(state, lin, before_cost, step, damping, accepted, sigma))
+        if accepted and (small or before_cost - after_cost < rules.gain * before_cost):
+            converged = True
+            break
+        if damping > 1e6:
+            break
+    return Outcome(state, lin, loss, converged, sigma)
+
+
+def _rescaled(loss: Loss, rules: Rules, sigma: float) -> Loss:
+    c = rules.robust * sigma
+    return replace(loss, robust_c=c, charge=c**2 if rules.robust else (3 * sigma) ** 2)
