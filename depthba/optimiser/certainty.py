@@ -15,8 +15,8 @@ from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
 from depthba.result import WeakDirection
 
-# A direction is weak when the measured pose holds more than this share of what is known about it.
-WEAK = 0.5
+# A direction is weak when more than this share of what is known about it comes from the measured pose.
+WEAK = 0.2
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,17 @@ from depthba.optimiser.problem import Problem
 
 # Scatter within a cell is measured on cells this many times the spacing of the points: fewer points say nothing.
 COARSEST = 3.0
+# Scatter up to this many times the typical one passes for noise.
+USUAL = 4.0
 
 
 def down_weighted(
-    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float, usual: float
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
 ) -> Problem:
     """Return the problem with the points of rough cells taken for as noisy as they are, fixed for the level.
 
     What one frame's points scatter about the averaged map within a cell is noise plus relief that the map cannot hold.
-    Up to ``usual`` times the typical scatter it is taken for noise; beyond, the point's noise grows with it. The weight
+    Up to a few times the typical scatter it is taken for noise; beyond, the point's noise grows with it. The weight
     hangs on the point, not on the cell: one that changes cell keeps it, so nothing is gained by moving.
     """
     grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
@@ -29,11 +31,14 @@ def down_weighted(
     typical = float(np.median(rough[rough > 0])) if (rough > 0).any() else 0.0
     if typical == 0.0:
         return problem
-    factor = 1.0 / np.maximum(1.0, rough / (usual * typical))
+    factor = 1.0 / np.maximum(1.0, rough / (USUAL * typical))
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         points = frame.points.copy()
-        points[:, 3] *= _look_up(factor, frame.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid)
+        a = _look_up(factor, frame.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid)
+        points[:, 3] *= a
+        # what a rough cell scatters is not noise but bias: it gets less than the weight of its variance
+        points[:, 4] *= a**2
         frames.append(replace(frame, points=points))
     return replace(problem, frames=tuple(frames))
 

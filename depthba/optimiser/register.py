@@ -28,13 +28,11 @@ from depthba.result import FrameReport, Iteration, Result, Status
 from depthba.trajectory import read_tum
 
 # Standard deviations of a measured pose where the dataset states none: a rig that was set up with some care.
-USUAL_T, USUAL_R = 0.01, 0.01
-import os
-WIDE=float(os.environ.get("WIDE","12"))
-GAIN=float(os.environ.get("GAIN","0.02"))
-def phases(index,preset):
-    if not preset.robust: return ("quadratic",)
-    return ("quadratic","robust") if index==0 or "QALL" in os.environ else ("robust",)
+USUAL_T, USUAL_R = 0.01, 0.02
+# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the rest is not.
+WIDE = 12.0
+# A level that only leads to the next is left when a step gains less than this share of its cost.
+GAIN = 0.02
 
 
 @dataclass(frozen=True)
@@ -126,19 +124,18 @@ def _register(
         level = make_level(problem, poses, spacing, preset, options)
         heights = level_heights(level, heights, previous)
         state, lin = solve_map(level.problem, level.grid, State(poses, heights), level.loss, level.smooth, workers, 1)
-        for phase in phases(index,preset):
+        for phase in phases(index, preset):
             last = index == len(levels) - 1 and (phase == "robust" or not preset.robust)
             rules = Rules(
-                preset.robust if phase == "robust" else (WIDE if preset.robust else 0.0),
+                _scale(preset, phase),
                 options.max_iterations,
-                gain=0.0 if last else GAIN, outer=int(os.environ.get("OUTER","12")), tolerance=float(os.environ.get("TOL","1e-2")),
+                gain=0.0 if last else GAIN,
             )
             temperature = 0.0
             if preset.prior:
                 factor = certainty.correlation(
                     level.problem, level.grid, state, level.loss, lin, prior, free, workers
                 ).inflation
-                if "VERB" in os.environ: print("inflation", factor)
                 temperature = factor * robust_sigma(lin.residuals) ** 2
 
             def report(p: Progress, level: Level = level, index: int = index, phase: str = phase) -> None:
@@ -157,6 +154,18 @@ def _register(
         dataset, options, preset, problem, level, outcome, prior, temperature, free, held, overlap,
         start, history, clock, workers,
     )  # fmt: skip
+
+
+def _scale(preset: schedule.Preset, phase: str) -> float:
+    """Return the robust scale of a phase, in robust standard deviations; 0 without a robust loss."""
+    return min(preset.robust, WIDE) if phase == "robust" else WIDE if preset.robust else 0.0
+
+
+def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
+    """Return the losses of a level: the robust one comes only when the poses have settled under a wide one."""
+    if not preset.robust:
+        return ("quadratic",)
+    return ("quadratic", "robust") if index == 0 else ("robust",)
 
 
 def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
@@ -205,8 +214,8 @@ def make_level(
     problem = problem.thinned(schedule.stride(problem, spacing))
     grid = make_grid(problem, spacing, 2 * spacing)
     averages = average(problem, poses, grid)
-    if preset.robust and 'NOLAY' not in os.environ:
-        problem = down_weighted(problem, poses, spacing, float(os.environ.get('STEEP','1')))
+    if preset.robust:
+        problem = down_weighted(problem, poses, spacing)
     seen = averages.count > 0
     smooth = np.ones(grid.shape, bool) if preset.whole else near(seen, 3)
     typical = float(np.median(averages.count[seen])) if seen.any() else 1.0

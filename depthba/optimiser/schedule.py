@@ -43,7 +43,7 @@ PRESETS = {
         along_ray=False, slope=False, robust=0.0, smoothing=0.1, relative=False, whole=True, prior=False
     ),
     "default": Preset(
-        along_ray=True, slope=True, robust=float(__import__("os").environ.get("ROB","3.5")), smoothing=1e-4, relative=True, whole=False, prior=True
+        along_ray=True, slope=True, robust=3.5, smoothing=1e-4, relative=True, whole=False, prior=True
     ),
 }  # fmt: skip
 

@@ -41,7 +41,7 @@ def industrial_6(seed: int) -> mujoco.MjSpec:
     plate = stepped_plate(place)
     # No stone under the plate is so tall that it would hang in the air; 1.2 t press the rest down.
     relief = _rubble(spec, seed, "industrial-6", (Keep(x, y, 0.9, above=0.14),))
-    rotation, position = rest_on_three(relief, x, y, yaw, plate.half[:2], pressed=0.5)
+    rotation, position = rest_on_three(relief, x, y, yaw, plate.half[:2], pressed=1.0)
     colours = [np.array(STEEL[k % len(STEEL)]) for k in range(len(plate.parts))]
     add_body(spec, relief, plate, rotation, position, colours, name="plate")
     # Loading shook some stones onto it.
@@ -68,12 +68,12 @@ def _rubble(spec: mujoco.MjSpec, seed: int, scene: str, keep: tuple[Keep, ...] =
     shapes = make_shapes(spec, rng, CRUSHED, sizes, 8)
     lumps = make_shapes(spec, rng, SLAG, sizes[:-2], 4)
     shapes = shapes + lumps
-    diameters = draw_diameters(rng, 2600, 0.05, 0.40, 2.1)
+    diameters = draw_diameters(rng, 1300, 0.05, 0.34, 1.7)
     large = diameters > 0.18
     everywhere = clear + wide + keep
     scrap = stream(seed, scene, "scrap")
     off = tuple(Keep(k.x, k.y, k.radius + 0.25) for k in clear + keep)
-    scatter_scrap(spec, scrap, relief, 55, _STREWN, off)
+    scatter_scrap(spec, scrap, relief, 36, _STREWN, off)
     scatter(spec, rng, relief, shapes, diameters[large], _STREWN, everywhere)
     scatter(spec, rng, relief, shapes, diameters[~large], _STREWN, everywhere)
 

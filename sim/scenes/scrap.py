@@ -50,13 +50,13 @@ def box(
 
 
 def _plate(rng: np.random.Generator) -> Body:
-    a, b, c = rng.uniform(0.12, 0.32), rng.uniform(0.07, 0.2), rng.uniform(0.006, 0.02)
+    a, b, c = rng.uniform(0.12, 0.32), rng.uniform(0.07, 0.2), rng.uniform(0.004, 0.010)
     return Body((box((a, b, c), (0, 0, c)),), (a, b, c))
 
 
 def _beam(rng: np.random.Generator) -> Body:
     """An I beam on its flange."""
-    a, b = rng.uniform(0.2, 0.55), rng.uniform(0.05, 0.1)
+    a, b = rng.uniform(0.2, 0.55), rng.uniform(0.022, 0.034)
     c, wall = b * rng.uniform(0.9, 1.2), 0.12 * b
     parts = (
         box((a, b, wall), (0, 0, wall)),
@@ -68,13 +68,13 @@ def _beam(rng: np.random.Generator) -> Body:
 
 def _angle(rng: np.random.Generator) -> Body:
     """An angle profile standing on one leg."""
-    a, b, wall = rng.uniform(0.2, 0.5), rng.uniform(0.04, 0.08), 0.006
+    a, b, wall = rng.uniform(0.2, 0.5), rng.uniform(0.020, 0.032), 0.004
     parts = (box((a, b, wall), (0, 0, wall)), box((a, wall, b), (0, wall - b, b)))
     return Body(parts, (a, b, b))
 
 
 def _pipe(rng: np.random.Generator) -> Body:
-    a, r = rng.uniform(0.2, 0.6), rng.uniform(0.03, 0.09)
+    a, r = rng.uniform(0.2, 0.6), rng.uniform(0.018, 0.035)
     return Body((Part(CYLINDER, (r, a), (0, 0, r), lying=True),), (a, r, r))
 
 
@@ -84,14 +84,14 @@ def _bar(rng: np.random.Generator) -> Body:
 
 
 def _disc(rng: np.random.Generator) -> Body:
-    r, c = rng.uniform(0.07, 0.18), rng.uniform(0.015, 0.04)
+    r, c = rng.uniform(0.07, 0.18), rng.uniform(0.008, 0.014)
     return Body(
         (Part(CYLINDER, (r, c), (0, 0, c)), Part(CYLINDER, (0.4 * r, c), (0, 0, 2 * c))), (r, r, c)
     )
 
 
 def _billet(rng: np.random.Generator) -> Body:
-    a, b = rng.uniform(0.15, 0.35), rng.uniform(0.05, 0.08)
+    a, b = rng.uniform(0.15, 0.35), rng.uniform(0.022, 0.032)
     return Body((box((a, b, b), (0, 0, b)),), (a, b, b))
 
 
@@ -145,5 +145,5 @@ def scatter_scrap(
         colour = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.8, 1.2)
         if any(np.hypot(k.x - x, k.y - y) < k.radius + body.half[0] for k in keep):
             continue
-        rotation, position = rest_on_three(relief, x, y, yaw, body.half[:2], pressed=0.7)
+        rotation, position = rest_on_three(relief, x, y, yaw, body.half[:2], pressed=1.0)
         add_body(spec, relief, body, rotation, position, [colour] * len(body.parts))

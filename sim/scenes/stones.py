@@ -2,7 +2,7 @@
 
 Crushed stone breaks into flat facets, so a stone is the intersection of random half-spaces; slag
 cools into lumps, so it is the hull of points on a bumpy ellipsoid. Axes ratios follow the usual
-range of crushed aggregate (b/a 0.65 to 0.95, c/b 0.5 to 0.9, after Zingg's classes).
+range of crushed aggregate (b/a 0.65 to 0.95, c/b 0.45 to 0.7, the flatter of Zingg's classes).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def make_shapes(
 
 def _axes(rng: np.random.Generator) -> Array:
     middle = rng.uniform(0.65, 0.95)
-    return np.array([1.0, middle, middle * rng.uniform(0.5, 0.9)])
+    return np.array([1.0, middle, middle * rng.uniform(0.45, 0.7)])
 
 
 def _crushed(rng: np.random.Generator) -> Hull:
@@ -154,7 +154,7 @@ def scatter(
         x, y = place
         rotation = _lie(rng, relief.slope(x, y, 0.5 * shape.diameter))
         planes = turned(shape.hull.planes, rotation)
-        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.45, 0.75))
+        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.75, 0.92))
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
         add_mesh_geom(spec, shape.mesh, np.array([x, y, z]), rotation, colour)
