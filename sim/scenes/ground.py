@@ -28,8 +28,8 @@ def make_ground(
     y = np.asarray(area[2] + spacing * np.arange(rows), np.float64)[:, None]
     # Undulation as left by a wheel loader: long swells and shorter ones, a few wavelengths only.
     z = _swell(rng, (rows, columns), 0.90 / spacing, 0.045)
-    z += _swell(rng, (rows, columns), 0.22 / spacing, 0.020)
-    z += _swell(rng, (rows, columns), 0.09 / spacing, 0.0055)
+    z += _swell(rng, (rows, columns), 0.22 / spacing, 0.034)
+    z += _swell(rng, (rows, columns), 0.09 / spacing, 0.010)
     for _ in range(heaps):
         z = np.maximum(z, _heap(rng, area, x, y, repose))
     z = gaussian_filter(z, 0.035 / spacing)

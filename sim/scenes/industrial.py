@@ -32,15 +32,15 @@ _SPACING = 0.025
 
 
 def industrial_6(seed: int) -> mujoco.MjSpec:
-    """A medium-thick plate with several planes, lying tilted on the rubble."""
+    """A medium-thick plate with several planes, bedded in the rubble."""
     spec = mujoco.MjSpec()
     spec.modelname = "industrial-6"
     place = stream(seed, "industrial-6", "plate")
     x, y = place.uniform(2.9, 4.1), place.uniform(2.5, 3.5)
     yaw = place.uniform(0.0, 2.0 * np.pi)
     plate = stepped_plate(place)
-    # No stone under the plate is so tall that it would hang in the air; 1.2 t press the rest down.
-    relief = _rubble(spec, seed, "industrial-6", (Keep(x, y, 0.9, above=0.14),))
+    # Its place was raked, with no stone left on which it would hang in the air.
+    relief = _rubble(spec, seed, "industrial-6", (Keep(x, y, 1.3, above=0.07),))
     rotation, position = rest_on_three(relief, x, y, yaw, plate.half[:2], pressed=1.0)
     colours = [np.array(STEEL[k % len(STEEL)]) for k in range(len(plate.parts))]
     add_body(spec, relief, plate, rotation, position, colours, name="plate")
@@ -60,7 +60,7 @@ def _rubble(spec: mujoco.MjSpec, seed: int, scene: str, keep: tuple[Keep, ...] =
     # Taller stones stay farther off, so that every frame sees the whole disc.
     wide = tuple(Keep(x, y, 0.35, above=0.12) for x, y in MARKERS.values())
     level = tuple(Keep(x, y, 0.06) for x, y in MARKERS.values())
-    relief = make_ground(stream(seed, scene, "ground"), _AREA, _SPACING, level)
+    relief = make_ground(stream(seed, scene, "ground"), _AREA, _SPACING, level + keep)
     add_ground(spec, relief, (0.15, 0.135, 0.117))
 
     rng = stream(seed, scene, "stones")

@@ -154,7 +154,7 @@ def scatter(
         x, y = place
         rotation = _lie(rng, relief.slope(x, y, 0.5 * shape.diameter))
         planes = turned(shape.hull.planes, rotation)
-        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.75, 0.92))
+        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.80, 0.94))
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
         add_mesh_geom(spec, shape.mesh, np.array([x, y, z]), rotation, colour)

@@ -14,7 +14,7 @@ def stepped_plate(rng: np.random.Generator) -> Body:
     a2, b2, c2 = rng.uniform(0.2, 0.26), rng.uniform(0.16, 0.22), rng.uniform(0.008, 0.012)
     x1, y1 = rng.uniform(-0.25, -0.1), rng.uniform(-0.1, 0.1)
     top, step = 2.0 * c, 2.0 * (c + c1)
-    bend, wing = np.radians(rng.uniform(6.0, 10.0)), rng.uniform(0.14, 0.2)
+    bend, wing = np.radians(rng.uniform(3.0, 5.0)), rng.uniform(0.14, 0.2)
     wing_at = (a + np.cos(bend) * wing, 0.0, c + np.sin(bend) * wing)
     parts = (
         box((a, b, c), (0.0, 0.0, c)),
