@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 class DepthMap:
     """Heights over a regular grid in the x-y plane of the map frame.
 
-    Node ``[y, x]`` stands at ``origin + spacing * (x, y)``. Between nodes the height is interpolated bilinearly.
+    Node ``[y, x]`` stands at ``origin + spacing * (x, y)``. Between nodes the height is
+    interpolated bilinearly.
     """
 
     heights: NDArray[np.float64]
@@ -26,7 +27,8 @@ class DepthMap:
     count: NDArray[np.int64]
     """(ny, nx), number of measured points that bear on the node."""
     sigma: NDArray[np.float64]
-    """(ny, nx), standard deviation of the height given the poses, metres; NaN where nothing was seen."""
+    """(ny, nx), standard deviation of the height given the poses, metres; NaN where nothing was
+    seen."""
 
     @property
     def shape(self) -> tuple[int, int]:

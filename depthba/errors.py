@@ -1,4 +1,7 @@
-"""The errors that depthba knows: each is one line that names the offender, its value and what was expected."""
+"""The errors that depthba knows.
+
+Each is one line that names the offender, its value and what was expected.
+"""
 
 
 class DepthbaError(Exception):

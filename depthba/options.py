@@ -1,4 +1,7 @@
-"""The options of a registration: one dataclass is the argument, the command line and the saved file."""
+"""The options of a registration.
+
+One dataclass is the argument, the command line and the saved file.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,24 @@ class Options:
     """How to register a dataset."""
 
     preset: Literal["default", "paper"] = "default"
-    """default: range residual, robust, coarse to fine. paper: the formulation of the paper to the letter."""
+    """default: range residual, robust, coarse to fine. paper: the formulation of the paper to the
+    letter."""
     resolution: float | None = None
     """Finest map spacing, m. None: close to the spacing of the points (paper: four times that)."""
     init: str = "measured"
     """Where to start: measured, identity, or a file of poses in TUM format."""
     roi: tuple[float, float, float, float, float, float] | None = None
-    """Region of interest xmin xmax ymin ymax zmin zmax in the map frame, m: points outside, at the start poses, are left out."""
+    """Region of interest xmin xmax ymin ymax zmin zmax in the map frame, m: points outside, at the
+    start poses, are left out."""
     threads: int | None = None
     """Threads of the kernels. None: all cores."""
     smoothing: float | None = None
     """Weight of the smoothing term against one point. None: the preset's own."""
     prior_t: float | None = None
-    """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.02 (paper: no prior)."""
+    """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.02
+    (paper: no prior)."""
     prior_r: float | None = None
-    """Standard deviation of the measured rotations, rad. None: the dataset's pose_noise, else 0.02 (paper: no prior)."""
+    """Standard deviation of the measured rotations, rad. None: the dataset's pose_noise, else 0.02
+    (paper: no prior)."""
     max_iterations: int = 30
     """Limit for each level and phase."""

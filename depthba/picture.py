@@ -182,7 +182,10 @@ def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
 def height_colours(
     heights: Floats, low: float | None = None, high: float | None = None
 ) -> NDArray[np.uint8]:
-    """Return (..., 3) colours from ``low`` to ``high`` m, by default 2 % and 98 % of the heights."""
+    """Return (..., 3) colours from ``low`` to ``high`` m.
+
+    By default 2 % and 98 % of the heights.
+    """
     known = heights[np.isfinite(heights)]
     if not len(known):
         return np.full((*heights.shape, 3), 230, np.uint8)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from depthba.depth_map import DepthMap
 
 Status = Literal["converged", "not_converged", "weak", "no_better"]
-"""``converged``: done, to be trusted. ``not_converged``: stopped at a limit. ``weak``: done, but the data leave a
-direction of motion or a frame open, which was held at its measured pose. ``no_better``: nothing better than the start
-was found, and the start poses are returned."""
+"""``converged``: done, to be trusted. ``not_converged``: stopped at a limit. ``weak``: done, but
+the data leave a direction of motion or a frame open, which was held at its measured pose.
+``no_better``: nothing better than the start was found, and the start poses are returned."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class WeakDirection:
     direction: NDArray[np.float64]
     """(6,) unit vector, translation then rotation times ``lever``, map axes."""
     lever: float
-    """Metres by which a rotation in radians is multiplied to compare it with a translation: the frame's extent."""
+    """Metres by which a rotation in radians is multiplied to compare it with a translation: the
+    frame's extent."""
     sigma: float
     """Standard deviation that the data alone leave along it, m."""
     prior_sigma: float
@@ -109,11 +110,13 @@ class Result:
     depth_map_start: DepthMap
     """The map that the start poses give, on the same grid."""
     covariance: NDArray[np.float64]
-    """(6N, 6N), translation then rotation per frame, world axes, left perturbation about the camera centre."""
+    """(6N, 6N), translation then rotation per frame, world axes, left perturbation about the camera
+    centre."""
     sigma: float
     """Robust standard deviation of the final residuals, m."""
     inflation: float
-    """Factor by which the residuals' correlation over the image inflates the covariance (1: independent)."""
+    """Factor by which the residuals' correlation over the image inflates the covariance (1:
+    independent)."""
     history: tuple[Iteration, ...]
     weak: tuple[WeakDirection, ...]
     frames: tuple[FrameReport, ...]

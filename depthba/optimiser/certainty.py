@@ -15,7 +15,8 @@ from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
 from depthba.result import WeakDirection
 
-# A direction is weak when more than this share of what is known about it comes from the measured pose.
+# A direction is weak when more than this share of what is known about it comes from the measured
+# pose.
 WEAK = 0.2
 
 
@@ -40,13 +41,14 @@ def correlation(
     workers: Workers,
     tolerance: float = 1e-3,
 ) -> Correlation:
-    """Measure by how much the residuals' correlation over the image inflates the variance of the poses.
+    """Measure how the residuals' correlation over the image inflates the variance of the poses.
 
-    Gradients are summed over blocks of the image, over all frames at once, since a fixed pattern is common to them
-    (cluster-robust variance, Liang & Zeger 1986). The same sums over as many random groups of points say what
-    independent residuals would give. Each gives a scatter of the estimate, ``V G V`` with ``V = (S + T P)^-1``; the
-    factor is the ratio of the two in units of the prior P, so that the directions count that the data hold least. The
-    prior's weight T depends on the factor in turn, which a few rounds settle.
+    Gradients are summed over blocks of the image, over all frames at once, since a fixed pattern is
+    common to them (cluster-robust variance, Liang & Zeger 1986). The same sums over as many random
+    groups of points say what independent residuals would give. Each gives a scatter of the
+    estimate, ``V G V`` with ``V = (S + T P)^-1``; the factor is the ratio of the two in units of
+    the prior P, so that the directions count that the data hold least. The prior's weight T depends
+    on the factor in turn, which a few rounds settle.
     """
     S = eliminate.exact(lin, workers, tolerance)
     keep = np.repeat(free, 6)
@@ -81,7 +83,10 @@ def block_scores(
     workers: Workers,
     tolerance: float = 0.1,
 ) -> NDArray[np.float64]:
-    """Return the reduced gradient of each block of points, (blocks, 6N): the map has answered to it."""
+    """Return the reduced gradient of each block of points, (blocks, 6N).
+
+    The map has answered to it.
+    """
     nodes = np.empty((*grid.shape, 3))
     kernels.nodal_gradients(state.heights, grid.spacing, nodes)
     fronts = fronts_of(problem, state.T_map_camera)
@@ -128,7 +133,8 @@ def assess(
         lin: its linearisation.
         S: (6N, 6N) exact reduced matrix.
         variance: m^2, of a residual, times its inflation.
-        prior: the measured poses; without belief in them they still judge which directions are weak.
+        prior: the measured poses; without belief in them they still judge which directions are
+            weak.
         believed: whether the prior took part in the solution.
         free: (N,) frames that moved.
         frame_ids: ids of the frames.
@@ -141,10 +147,9 @@ def assess(
     posterior = np.linalg.inv(data + held)
     weak = _weak_directions(posterior, held, free, frame_ids, problem)
     about_pivots = np.zeros((6 * n, 6 * n))
-    # without belief in the prior a trace of it stays, so that open directions are large and not infinite
-    about_pivots[np.ix_(keep, keep)] = (
-        posterior if believed else np.linalg.inv(data + 1e-12 * held)
-    )
+    # without belief in the prior a trace of it stays, so that open directions are large and not
+    # infinite
+    about_pivots[np.ix_(keep, keep)] = posterior if believed else np.linalg.inv(data + 1e-12 * held)
     for i in np.flatnonzero(~free):
         if prior.information[i].any():
             inverse = np.linalg.inv(J[i])
@@ -172,8 +177,9 @@ def _weak_directions(
 ) -> tuple[WeakDirection, ...]:
     """Find where a frame's posterior owes more to its measured pose than to the data.
 
-    In units of the prior a posterior variance lies between 0 (the data say all) and 1 (they say nothing). Directions
-    are taken about the frame's own centroid, where shift and turn are least alike.
+    In units of the prior a posterior variance lies between 0 (the data say all) and 1 (they say
+    nothing). Directions are taken about the frame's own centroid, where shift and turn are least
+    alike.
     """
     weak = []
     for k, i in enumerate(np.flatnonzero(free)):
@@ -202,7 +208,10 @@ def _weak_directions(
 
 
 def direction_name(direction: NDArray[np.float64]) -> str:
-    """Name a unit direction (6,) for people, by its main parts: ``x``, ``turn about z``, ``0.8 x + 0.6 y``."""
+    """Name a unit direction (6,) for people, by its main parts.
+
+    ``x``, ``turn about z``, ``0.8 x + 0.6 y``.
+    """
     names = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
     direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
     order = [int(k) for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > 0.3]

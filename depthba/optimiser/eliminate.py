@@ -1,9 +1,12 @@
 """Eliminating the map: from the joint normal equations to the poses alone, and back.
 
-The reduced matrix is ``S = A - B C^-1 B^T`` over the free frames. Its *lumped* bound replaces C by the diagonal of its
-absolute row sums; that sum over the nodes two frames share needs no factorisation and preconditions conjugate gradients
-on the exact S, each product of which is one solve with C.
+The reduced matrix is ``S = A - B C^-1 B^T`` over the free frames. Its *lumped* bound replaces C by
+the diagonal of its absolute row sums; that sum over the nodes two frames share needs no
+factorisation and preconditions conjugate gradients on the exact S, each product of which is one
+solve with C.
 """
+
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 
 from __future__ import annotations
 
@@ -17,6 +20,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from depthba.optimiser.linearise import Footprint, Linearisation, Workers
 
+# Nodes beyond a footprint after which the map's answer to it has died away: where there are data it
+# falls by about four from one node to the next.
+REACH = 24
+
 
 @dataclass(frozen=True)
 class Step:
@@ -27,8 +34,8 @@ class Step:
     map: NDArray[np.float64]
     """(ny, nx)."""
     decrement: float
-    """``pose^T S pose`` with the undamped reduced matrix: the step's length in its own uncertainty, squared, times
-    the residual variance."""
+    """``pose^T S pose`` with the undamped reduced matrix: the step's length in its own uncertainty,
+    squared, times the residual variance."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -86,7 +93,10 @@ def gather(lin: Linearisation, field: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def lumped(lin: Linearisation, workers: Workers) -> NDArray[np.float64]:
-    """Return the lumped reduced matrix of all frames, (6N, 6N): it bounds the exact one from above."""
+    """Return the lumped reduced matrix of all frames, (6N, 6N).
+
+    It bounds the exact one from above.
+    """
     n = len(lin.B)
     bound = lin.C.row_sums()
     S = np.zeros((n, 6, n, 6))
@@ -108,18 +118,29 @@ def lumped(lin: Linearisation, workers: Workers) -> NDArray[np.float64]:
 
 
 def exact(lin: Linearisation, workers: Workers, tolerance: float = 1e-10) -> NDArray[np.float64]:
-    """Return the exact reduced matrix of all frames, (6N, 6N), by one solve with C for each of its columns."""
+    """Return the exact reduced matrix of all frames, (6N, 6N).
+
+    That takes one solve with C for each of its columns.
+    """
     n = len(lin.B)
+
+    ny, nx = lin.g_map.shape
 
     def columns(i: int) -> NDArray[np.float64]:
         out = np.zeros((6, n, 6))
         foot = lin.B[i]
         if not foot.values.any():
             return out
+        h, w = foot.values.shape[:2]
+        y0, x0 = max(foot.y - REACH, 0), max(foot.x - REACH, 0)
+        window = slice(y0, min(foot.y + h + REACH, ny)), slice(x0, min(foot.x + w + REACH, nx))
+        C = lin.C.window(*window)
+        field = np.zeros((ny, nx))
         for m in range(6):
-            b = np.zeros_like(lin.g_map)
-            b[foot.window] = foot.values[..., m]
-            out[m] = gather(lin, lin.C.solve(b, tolerance)[0])
+            field[window] = 0.0
+            field[foot.window] = foot.values[..., m]
+            field[window] = C.solve(np.ascontiguousarray(field[window]), tolerance)[0]
+            out[m] = gather(lin, field)
         return out
 
     S = -np.stack(workers.map(columns, range(n)))
@@ -130,7 +151,10 @@ def exact(lin: Linearisation, workers: Workers, tolerance: float = 1e-10) -> NDA
 
 
 def exact_sparse(lin: Linearisation) -> NDArray[np.float64]:
-    """Return the exact reduced matrix by a sparse factorisation of C: the reference for :func:`exact`."""
+    """Return the exact reduced matrix by a sparse factorisation of C.
+
+    The reference for :func:`exact`.
+    """
     n = len(lin.B)
     factor = scipy.sparse.linalg.splu(lin.C.sparse())
     B = np.zeros((*lin.g_map.shape, 6 * n))
@@ -152,7 +176,9 @@ def solve(
     tolerance: float,
     outer: int,
 ) -> Step:
-    """Solve the damped normal equations: the map goes out of them, the poses are solved for, the map answers.
+    """Solve the damped normal equations.
+
+    The map goes out of them, the poses are solved for, the map answers.
 
     Args:
         lin: the normal equations.
@@ -195,8 +221,11 @@ def solve(
     return Step(steps, answer - back, float(x @ Sx))
 
 
-def _preconditioned(product, factor, damp, b, tolerance, limit):  # type: ignore[no-untyped-def]
-    """Conjugate gradients on ``S + diag(damp)``, preconditioned by the lumped factor; returns x and S x."""
+def _preconditioned(product, factor, damp, b, tolerance, limit):
+    """Conjugate gradients on ``S + diag(damp)``, preconditioned by the lumped factor.
+
+    Returns x and S x.
+    """
     x, Sx = np.zeros_like(b), np.zeros_like(b)
     if limit == 0:
         x = cho_solve(factor, b)
@@ -227,4 +256,4 @@ def _preconditioned(product, factor, damp, b, tolerance, limit):  # type: ignore
 def _meet(a: Footprint, b: Footprint) -> bool:
     ha, wa = a.values.shape[:2]
     hb, wb = b.values.shape[:2]
-    return a.y < b.y + hb and b.y < a.y + ha and a.x < b.x + wb and b.x < a.x + wa
+    return bool(a.y < b.y + hb and b.y < a.y + ha and a.x < b.x + wb and b.x < a.x + wa)

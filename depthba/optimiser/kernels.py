@@ -1,28 +1,32 @@
 """The passes over the points: residuals and their accumulation into the normal equations.
 
-Equation numbers refer to "Correspondence-Free Multiview Point Cloud Registration via Depth-Guided Joint Optimisation".
-The map is read through *nodes*: an (ny, nx, 3) array of height and its nodal gradient (central differences), both
-interpolated bilinearly, as the paper does. The state of frame i is perturbed on the left about a pivot c in the map
-frame: ``q <- Exp(phi) (q - c) + c + tau``; a row of the Jacobian is then ``[n, (q - c) x n]`` with the surface normal
-``n = (-dD/dx, -dD/dy, 1)`` (eq. JP of the paper, whose Euler angles only parametrise the same step).
+Equation numbers refer to "Correspondence-Free Multiview Point Cloud Registration via Depth-Guided
+Joint Optimisation". The map is read through *nodes*: an (ny, nx, 3) array of height and its nodal
+gradient (central differences), both interpolated bilinearly, as the paper does. The state of frame
+i is perturbed on the left about a pivot c in the map frame: ``q <- Exp(phi) (q - c) + c + tau``; a
+row of the Jacobian is then ``[n, (q - c) x n]`` with the surface normal ``n = (-dD/dx, -dD/dy, 1)``
+(eq. JP of the paper, whose Euler angles only parametrise the same step).
 
-All kernels release the GIL, so that threads run one group of frames each; sums inside a group have a fixed order.
+All kernels release the GIL, so that threads run one group of frames each; sums inside a group have
+a fixed order.
 """
 
 from __future__ import annotations
 
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 import numba as nb
 import numpy as np
 
 # Height of the residual's floor: lateral noise of a point, relative to its range noise, squared.
 LATERAL = 0.05
-# |n.u| below this is a grazing ray: the walk along it is not to be trusted, so its length is bounded.
+# |n.u| below this is a grazing ray: the walk along it is not to be trusted, so its length is
+# bounded.
 GRAZING = 0.3
 
 
 @nb.njit(cache=True, nogil=True)
 def nodal_gradients(heights, spacing, nodes):
-    """Fill ``nodes`` (ny, nx, 3) with the heights and their central differences (one-sided at the border)."""
+    """Fill ``nodes`` (ny, nx, 3) with heights and central differences, one-sided at the border."""
     ny, nx = heights.shape
     for y in range(ny):
         y0, y1 = max(y - 1, 0), min(y + 1, ny - 1)
@@ -46,11 +50,12 @@ def _read(nodes, x, y, a, b):
 
 @nb.njit(cache=True, nogil=True, inline="always")
 def _residual(px, py, pz, R, t, origin, spacing, nodes, along_ray, slope, front, cap):
-    """Residual of one point: (on the map?, cell x, y, fractions a, b, q relative to t, residual, norm, gx, gy).
+    """Residual of one point.
 
-    ``residual / norm`` is the signed distance in metres. Along the ray it is taken at the foot, where the viewing ray
-    meets the map (two Newton steps): a residual read at the noisy point itself correlates with the map's gradient
-    there, a bias that grows with the noise variance.
+    Returns: on the map?, cell x, y, fractions a, b, the point (3 values) relative to t, residual,
+    norm, gx, gy. ``residual / norm`` is the signed distance in metres. Along the ray it is taken at
+    the foot, where the viewing ray meets the map (two Newton steps): a residual read at the noisy
+    point itself correlates with the map's gradient there, a bias that grows with its variance.
     """
     ny, nx = nodes.shape[0], nodes.shape[1]
     qx = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
@@ -68,7 +73,8 @@ def _residual(px, py, pz, R, t, origin, spacing, nodes, along_ray, slope, front,
         for _ in range(2):
             d, gx, gy = _read(nodes, x, y, cx - x, cy - y)
             nu = front * (uz - gx * ux - gy * uy)
-            # a surface seen from behind or at a grazing angle: walk no further than a bounded slope allows
+            # a surface seen from behind or at a grazing angle: walk no further than a bounded slope
+            # allows
             nu = front * max(nu, GRAZING)
             step = (fz + t[2] - d) / nu
             walked = min(max(walked + step, -cap), cap)
@@ -94,18 +100,20 @@ def _residual(px, py, pz, R, t, origin, spacing, nodes, along_ray, slope, front,
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "arcp"})
 def accumulate(
-    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap, robust_c, judged_c, charge,
+    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
+    robust_c, judged_c, charge,
     weights, residuals, stencil, A, g, B, bx, by,
 ):  # fmt: skip
-    """One pass over a frame's points (n, 5: x, y, z in the sensor frame, m, the inverse of its relative
-    noise, and its share: a factor on its cost).
+    """Run over a frame's points once and accumulate all of its normal equations.
 
-    Adds to the frame's ``A`` (6, 6), ``g`` (6,) and ``B`` (h, w, 6; its corner at node (bx, by)) and to the map's
-    ``stencil`` (ny, nx, 6): the node's own term, its couplings to x+1, y+1, (x+1, y+1), of x+1 with y+1, and gradient.
-    ``arm`` is the sensor's centre relative to the pivot. Writes each point's robust weight and normalised residual
-    (NaN off the map).
-    Returns the Geman-McClure cost at scale ``robust_c``, whose weights the equations carry, and at ``judged_c`` (0:
-    squares); every point off the map costs ``charge`` there, so that none is lost for free; and the points used.
+    A point (of n, 5) is x, y, z in the sensor frame, m, the inverse of its relative noise, and its
+    share: a factor on its cost. Adds to the frame's ``A`` (6, 6), ``g`` (6,) and ``B`` (h, w, 6;
+    its corner at node (bx, by)) and to the map's ``stencil`` (ny, nx, 6): the node's own term, its
+    couplings to x+1, y+1, (x+1, y+1), of x+1 with y+1, and gradient. ``arm`` is the sensor's centre
+    relative to the pivot. Writes each point's robust weight and normalised residual (NaN off the
+    map). Returns the Geman-McClure cost at scale ``robust_c``, whose weights the equations carry,
+    and at ``judged_c`` (0: squares); every point off the map costs ``charge`` there, so that none
+    is lost for free; and the points used.
     """
     cost, judged, used = 0.0, 0.0, 0
     c2, j2 = robust_c * robust_c, judged_c * judged_c
@@ -115,7 +123,8 @@ def accumulate(
         own = points[k, 3]
         share = points[k, 4]
         on, x, y, a, b, qx, qy, qz, r, norm, gx, gy = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes, along_ray, slope, front, cap
+            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+            along_ray, slope, front, cap,
         )  # fmt: skip
         on = on and x >= bx and y >= by and x + 1 < bx + width and y + 1 < by + height
         if not on or share <= 0.0:
@@ -147,13 +156,18 @@ def accumulate(
         for m in range(6):
             wj = w * j[m]
             g[m] += wj * r
-            for l in range(m + 1):
-                A[m, l] += wj * j[l]
+            for n in range(m + 1):
+                A[m, n] += wj * j[n]
             lower[x - bx, m] -= wj * h00
             lower[x + 1 - bx, m] -= wj * h10
             upper[x - bx, m] -= wj * h01
             upper[x + 1 - bx, m] -= wj * h11
-        s00, s10, s01, s11 = stencil[y, x], stencil[y, x + 1], stencil[y + 1, x], stencil[y + 1, x + 1]
+        s00, s10, s01, s11 = (
+            stencil[y, x],
+            stencil[y, x + 1],
+            stencil[y + 1, x],
+            stencil[y + 1, x + 1],
+        )
         s00[0] += w * h00 * h00
         s10[0] += w * h10 * h10
         s01[0] += w * h01 * h01
@@ -177,12 +191,13 @@ def block_gradient(
     points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
     weights, blocks, block, g, gradient,
 ):  # fmt: skip
-    """Add to ``g`` (6,) and the map's ``gradient`` (ny, nx) what the points of one image block contribute."""
+    """Add what one image block contributes to ``g`` (6,) and to the map's ``gradient`` (ny, nx)."""
     for k in range(points.shape[0]):
         if blocks[k] != block or weights[k] <= 0.0:
             continue
         on, x, y, a, b, qx, qy, qz, r, norm, gx, gy = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes, along_ray, slope, front, cap
+            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+            along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue
@@ -219,7 +234,10 @@ def splat(points, R, t, origin, spacing, total, count):
 
 @nb.njit(cache=True, nogil=True)
 def splat_residuals(points, R, t, origin, spacing, nodes, total, squares, count):
-    """Add the points' vertical distances from the map to the nodes nearest to them: sum, squares and number."""
+    """Add the points' vertical distances from the map to the nodes nearest to them.
+
+    Sum, squares and number.
+    """
     ny, nx = total.shape
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]

@@ -1,4 +1,7 @@
-"""Cells that one height cannot describe: walls, edges, one thing above another. Their points count for less."""
+"""Cells that one height cannot describe: walls, edges, one thing above another.
+
+Their points count for less.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,22 @@ from depthba.optimiser import kernels
 from depthba.optimiser.grid import Grid, average, filled, make_grid
 from depthba.optimiser.problem import Problem
 
-# Scatter within a cell is measured on cells this many times the spacing of the points: fewer points say nothing.
+# Scatter within a cell is measured on cells this many times the spacing of the points: fewer points
+# say nothing.
 COARSEST = 3.0
 # Scatter up to this many times the typical one passes for noise.
 USUAL = 4.0
 
 
-def down_weighted(
-    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
-) -> Problem:
-    """Return the problem with the points of rough cells taken for as noisy as they are, fixed for the level.
+def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: float) -> Problem:
+    """Return the problem with the points of rough cells taken for as noisy as they are.
 
-    What one frame's points scatter about the averaged map within a cell is noise plus relief that the map cannot hold.
-    Up to a few times the typical scatter it is taken for noise; beyond, the point's noise grows with it. The weight
-    hangs on the point, not on the cell: one that changes cell keeps it, so nothing is gained by moving.
+    Fixed for the level.
+
+    What one frame's points scatter about the averaged map within a cell is noise plus relief that
+    the map cannot hold. Up to a few times the typical scatter it is taken for noise; beyond, the
+    point's noise grows with it. The weight hangs on the point, not on the cell: one that changes
+    cell keeps it, so nothing is gained by moving.
     """
     grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
     rough = scatter(problem, T_map_camera, grid)
@@ -37,16 +42,18 @@ def down_weighted(
         points = frame.points.copy()
         a = _look_up(factor, frame.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid)
         points[:, 3] *= a
-        # what a rough cell scatters is not noise but bias: it gets less than the weight of its variance
+        # what a rough cell scatters is not noise but bias: it gets less than the weight of its
+        # variance
         points[:, 4] *= a**2
         frames.append(replace(frame, points=points))
     return replace(problem, frames=tuple(frames))
 
 
-def scatter(
-    problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid
-) -> NDArray[np.float64]:
-    """Return (ny, nx) the standard deviation within a frame of heights about the averaged map, pooled over frames."""
+def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
+    """Return (ny, nx) the standard deviation within a frame of heights about the averaged map.
+
+    Pooled over frames.
+    """
     nodes = np.empty((*grid.shape, 3))
     kernels.nodal_gradients(
         filled(average(problem, T_map_camera, grid).heights), grid.spacing, nodes
@@ -55,7 +62,8 @@ def scatter(
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         total, square, count = (np.zeros(grid.shape) for _ in range(3))
         kernels.splat_residuals(
-            frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes, total, square, count
+            frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes,
+            total, square, count,
         )  # fmt: skip
         several = count > 1
         squares[several] += square[several] - total[several] ** 2 / count[several]

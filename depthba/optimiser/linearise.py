@@ -1,4 +1,7 @@
-"""Linearising the problem: one pass over all points fills the normal equations of poses and map together."""
+"""Linearising the problem.
+
+One pass over all points fills the normal equations of poses and map together.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +64,10 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Normal equations ``[A B; B^T C] [pose; map] = -[g_pose; g_map]`` at a state, and what the points said there."""
+    """Normal equations at a state, ``[A B; B^T C] [pose; map] = -[g_pose; g_map]``.
+
+    With them goes what the points said there.
+    """
 
     A: NDArray[np.float64]
     """(N, 6, 6)."""
@@ -86,7 +92,10 @@ class Linearisation:
 
 
 class Workers:
-    """A few threads over which frames are dealt out; sums are formed in a fixed order, whatever finishes first."""
+    """A few threads over which frames are dealt out.
+
+    Sums are formed in a fixed order, whatever finishes first.
+    """
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -101,13 +110,15 @@ class Workers:
     def close(self) -> None:
         """End the threads."""
         if self._pool is not None:
-            self._pool.shutdown()
+            self._pool.shutdown(wait=False, cancel_futures=True)
 
     def shares(self, problem: Problem) -> list[range]:
         """Deal the frames out in runs of about equal numbers of points."""
         sizes = np.array([len(f) for f in problem.frames], dtype=float)
         ends = np.cumsum(sizes) - sizes / 2
-        share = np.minimum((ends / max(sizes.sum(), 1) * self.threads).astype(int), self.threads - 1)
+        share = np.minimum(
+            (ends / max(sizes.sum(), 1) * self.threads).astype(int), self.threads - 1
+        )
         return [
             range(int(np.flatnonzero(share == k)[0]), int(np.flatnonzero(share == k)[-1]) + 1)
             for k in range(self.threads)
@@ -118,12 +129,18 @@ class Workers:
 def pivots_of(problem: Problem, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return each frame's centroid in the map frame, (N, 3)."""
     return np.stack(
-        [T[:3, :3] @ f.centroid + T[:3, 3] for f, T in zip(problem.frames, T_map_camera, strict=True)]
+        [
+            T[:3, :3] @ f.centroid + T[:3, 3]
+            for f, T in zip(problem.frames, T_map_camera, strict=True)
+        ]
     )
 
 
 def fronts_of(problem: Problem, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) the sign of n.u for a surface that faces the sensor: -1 where it looks down on the map."""
+    """Return (N,) the sign of n.u for a surface that faces the sensor.
+
+    -1 where it looks down on the map.
+    """
     down = [T[2, :3] @ f.centroid for f, T in zip(problem.frames, T_map_camera, strict=True)]
     return np.where(np.array(down) > 0, 1.0, -1.0)
 
@@ -158,7 +175,10 @@ def linearise(
     weights = tuple(np.empty(len(f), np.float32) for f in problem.frames)
     residuals = tuple(np.empty(len(f), np.float32) for f in problem.frames)
     judge = judge or loss
-    B: list[Footprint] = [_empty_footprint(f, T, grid, loss) for f, T in zip(problem.frames, state.T_map_camera, strict=True)]
+    B: list[Footprint] = [
+        _empty_footprint(f, T, grid, loss)
+        for f, T in zip(problem.frames, state.T_map_camera, strict=True)
+    ]
 
     def share(frames: range) -> NDArray[np.float64]:
         total = np.zeros((*grid.shape, 6))
@@ -168,7 +188,8 @@ def linearise(
                 problem.frames[i].points, pose[:3, :3].copy(), pose[:3, 3].copy(),
                 pose[:3, 3] - pivots[i], grid.origin, grid.spacing, nodes,
                 loss.along_ray, loss.slope, fronts[i], loss.cap, loss.robust_c, judge.robust_c,
-                judge.charge, weights[i], residuals[i], total, A[i], g[i], B[i].values, B[i].x, B[i].y,
+                judge.charge, weights[i], residuals[i], total,
+                A[i], g[i], B[i].values, B[i].x, B[i].y,
             )  # fmt: skip
         return total
 
@@ -184,7 +205,8 @@ def linearise(
     C.own[C.own <= 0.0] = 1.0
     return Linearisation(
         A, g, tuple(B), C, g_map,
-        float(costs[:, 0].sum()) + smoothing, float(costs[:, 1].sum()) + smoothing, int(costs[:, 2].sum()),
+        float(costs[:, 0].sum()) + smoothing, float(costs[:, 1].sum()) + smoothing,
+        int(costs[:, 2].sum()),
         weights, residuals, pivots,
     )  # fmt: skip
 
@@ -215,7 +237,10 @@ def _add_smoothing(
     weight: float,
     smooth: NDArray[np.bool_],
 ) -> float:
-    """Add ``weight * (difference of neighbouring heights)^2`` to the map's block; return that cost."""
+    """Add ``weight * (difference of neighbouring heights)^2`` to the map's block.
+
+    Return that cost.
+    """
     along_x = weight * (smooth[:, :-1] & smooth[:, 1:])
     along_y = weight * (smooth[:-1] & smooth[1:])
     dx, dy = np.diff(heights, axis=1), np.diff(heights, axis=0)

@@ -9,7 +9,8 @@ from depthba.optimiser import kernels
 from depthba.optimiser.grid import make_grid
 from depthba.optimiser.problem import Problem
 
-# Of a frame's cells, the share that others must see too; below it the frame is held where it was measured.
+# Of a frame's cells, the share that others must see too; below it the frame is held where it was
+# measured.
 LEAST = 0.05
 # Points below which a frame says nothing.
 FEWEST = 50
@@ -18,7 +19,10 @@ FEWEST = 50
 def overlap_matrix(
     problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
 ) -> NDArray[np.float64]:
-    """Return (N, N), the share of frame i's cells that frame j sees too; 0 for a frame without points."""
+    """Return (N, N), the share of frame i's cells that frame j sees too.
+
+    0 for a frame without points.
+    """
     grid = make_grid(problem, max(spacing, 4 * problem.spacing), 0.0)
     seen = np.zeros((len(problem.frames), grid.shape[0] * grid.shape[1]), np.float32)
     for i, (frame, T) in enumerate(zip(problem.frames, T_map_camera, strict=True)):
@@ -35,8 +39,8 @@ def overlap_matrix(
 def held_frames(problem: Problem, overlap: NDArray[np.float64]) -> list[str]:
     """Return, per frame, why it cannot move; empty where it can. Frame 0 fixes the gauge.
 
-    Frames that no chain of overlaps ties to frame 0 may still be registered among each other: the measured poses
-    hold them as a group. A frame that no other sees enough of is held alone.
+    Frames that no chain of overlaps ties to frame 0 may still be registered among each other: the
+    measured poses hold them as a group. A frame that no other sees enough of is held alone.
     """
     reasons = []
     for i, frame in enumerate(problem.frames):

@@ -12,7 +12,10 @@ from depthba import se3
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Gaussian priors on the poses; the error is ``[t - t_measured, log(R R_measured^T)]``, map axes."""
+    """Gaussian priors on the poses.
+
+    The error is ``[t - t_measured, log(R R_measured^T)]``, map axes.
+    """
 
     T_map_camera: NDArray[np.float64]
     """(N, 4, 4), measured."""
@@ -29,8 +32,8 @@ class PosePrior:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the matrix (N, 6, 6) and gradient (N, 6) in perturbations about the pivots (N, 3).
 
-        The derivative of the rotation's logarithm is taken as the identity: its error is of second order in an angle
-        that is small wherever the prior matters.
+        The derivative of the rotation's logarithm is taken as the identity: its error is of second
+        order in an angle that is small wherever the prior matters.
         """
         J = about_pivot(T_map_camera, pivots)
         e = se3.difference(T_map_camera, self.T_map_camera)

@@ -23,16 +23,18 @@ class FramePoints:
     """The points of one frame, in the sensor frame."""
 
     points: NDArray[np.float32]
-    """(n, 5): x, y, z in metres, the inverse of the point's noise relative to the typical one, and the share of its
-    cost that counts."""
+    """(n, 5): x, y, z in metres, the inverse of the point's noise relative to the typical one, and
+    the share of its cost that counts."""
     blocks: NDArray[np.uint8]
     """(n,), the block of the image that each point lies in."""
     centroid: NDArray[np.float64]
-    """(3,), about which the frame is perturbed: its translation and rotation are then told apart."""
+    """(3,), about which the frame is perturbed: its translation and rotation are then told
+    apart."""
     hull: NDArray[np.float64]
     """(k, 3), extreme points: enough for the frame's bounds under any pose."""
     extent: float
-    """Root mean square distance of the points from the centroid, m: the lever that compares rotation with shift."""
+    """Root mean square distance of the points from the centroid, m: the lever that compares
+    rotation with shift."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -43,7 +45,7 @@ class FramePoints:
             return self
         return FramePoints(
             np.ascontiguousarray(self.points[::stride]),
-            self.blocks[::stride],
+            np.ascontiguousarray(self.blocks[::stride]),
             self.centroid,
             self.hull,
             self.extent,
@@ -102,7 +104,8 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
     if sum(len(p) > 0 for p in clouds) < 2:
         seen = [f.id for f, p in zip(dataset, clouds, strict=True) if len(p)]
         raise DatasetError(
-            f"{dataset.path}: only frame {seen[0]} has valid depth, but registration needs 2 or more"
+            f"{dataset.path}: only frame {seen[0]} has valid depth, but registration "
+            "needs 2 or more"
         )
     sigmas = [_sigma(dataset.sensor.noise, p) for p in clouds]
     typical = float(np.median(np.concatenate([s[:: max(1, len(s) // 2000)] for s in sigmas])))
@@ -125,17 +128,23 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
 def choose_map_frame(
     dataset: Dataset, clouds: list[NDArray[np.float32]], T_world_camera: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return T_map_world: the world itself where the dataset says so, else a plane facing the sensors.
+    """Return T_map_world: the world itself where the dataset says so.
 
-    The z axis is the mean viewing direction reversed; where the sensors look in no common direction, the normal of
-    the plane fitted to all points, on the side of the sensors. The x axis stays as close to the world's as it can.
+    Else a plane facing the sensors.
+
+    The z axis is the mean viewing direction reversed; where the sensors look in no common
+    direction, the normal of the plane fitted to all points, on the side of the sensors. The x axis
+    stays as close to the world's as it can.
     """
     if dataset.map_frame == "world":
         return np.eye(4)
     z = -T_world_camera[:, :3, 2].mean(axis=0)
     if np.linalg.norm(z) < 0.5:
         world = np.concatenate(
-            [p[:: max(1, len(p) // 2000)] @ T[:3, :3].T + T[:3, 3] for p, T in zip(clouds, T_world_camera, strict=True)]
+            [
+                p[:: max(1, len(p) // 2000)] @ T[:3, :3].T + T[:3, 3]
+                for p, T in zip(clouds, T_world_camera, strict=True)
+            ]
         )  # fmt: skip
         centred = world - world.mean(axis=0)
         z = np.linalg.eigh(centred.T @ centred)[1][:, 0]
@@ -172,9 +181,7 @@ def _check_roi(roi: Roi) -> None:
             )
 
 
-def _crop(
-    points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi
-) -> NDArray[np.float32]:
+def _crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDArray[np.float32]:
     q = points @ T[:3, :3].T + T[:3, 3]
     inside = ((q >= np.array(roi[0::2])) & (q <= np.array(roi[1::2]))).all(axis=1)
     return np.ascontiguousarray(points[inside])
@@ -186,9 +193,7 @@ def _sigma(noise: RangeNoise | None, points: NDArray[np.float32]) -> NDArray[np.
     return np.asarray(noise.sigma(points[:, 2].astype(float)))
 
 
-def _frame(
-    points: NDArray[np.float32], weight: NDArray[np.float64], sensor: Sensor
-) -> FramePoints:
+def _frame(points: NDArray[np.float32], weight: NDArray[np.float64], sensor: Sensor) -> FramePoints:
     n = len(points)
     if n == 0:
         return FramePoints(
@@ -203,7 +208,10 @@ def _frame(
 
 
 def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
-    """Return the image block of each point: over the sensor's image, or over the directions that a cloud spans."""
+    """Return the image block of each point.
+
+    Over the sensor's image, or over the directions that a cloud spans.
+    """
     if sensor.camera is not None:
         camera = sensor.camera
         across = (points[:, 0] / points[:, 2] * camera.fx + camera.cx + 0.5) / camera.width
@@ -213,7 +221,7 @@ def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
         across, down = (spread / np.maximum(spread.max(axis=0), 1e-9)).T
     columns = np.clip((across * BLOCKS[0]).astype(int), 0, BLOCKS[0] - 1)
     rows = np.clip((down * BLOCKS[1]).astype(int), 0, BLOCKS[1] - 1)
-    return (rows * BLOCKS[0] + columns).astype(np.uint8)
+    return np.asarray(rows * BLOCKS[0] + columns, np.uint8)
 
 
 def _extremes(points: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -233,7 +241,10 @@ def _bounds(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Bounds of the points in x and y, less a handful of strays that would blow up the map."""
     xy = np.concatenate(
-        [p[:: max(1, len(p) // 20000)] @ T[:2, :3].T + T[:2, 3] for p, T in zip(clouds, T_map_camera, strict=True)]
+        [
+            p[:: max(1, len(p) // 20000)] @ T[:2, :3].T + T[:2, 3]
+            for p, T in zip(clouds, T_map_camera, strict=True)
+        ]
     )  # fmt: skip
     low, high = np.quantile(xy, [0.001, 0.999], axis=0)
     reach = 0.1 * (high - low)

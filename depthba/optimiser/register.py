@@ -15,7 +15,7 @@ from depthba import se3
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import OptionError
-from depthba.optimiser import certainty, eliminate, schedule
+from depthba.optimiser import certainty, schedule
 from depthba.optimiser.grid import Averages, Grid, average, filled, make_grid, near, resample
 from depthba.optimiser.layers import down_weighted
 from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
@@ -27,9 +27,11 @@ from depthba.options import Options
 from depthba.result import FrameReport, Iteration, Result, Status
 from depthba.trajectory import read_tum
 
-# Standard deviations of a measured pose where the dataset states none: a rig that was set up with some care.
+# Standard deviations of a measured pose where the dataset states none: a rig that was set up with
+# some care.
 USUAL_T, USUAL_R = 0.01, 0.02
-# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the rest is not.
+# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the
+# rest is not.
 WIDE = 12.0
 # A level that only leads to the next is left when a step gains less than this share of its cost.
 GAIN = 0.02
@@ -114,7 +116,9 @@ def _register(
     held = held_frames(problem, overlap)
     free = np.array([not reason for reason in held])
     measured = problem.T_map_world @ dataset.T_world_camera_measured
-    prior = pose_prior(measured, problem.T_map_world[:3, :3], sigma_t, sigma_r, np.arange(len(free)) == 0)
+    prior = pose_prior(
+        measured, problem.T_map_world[:3, :3], sigma_t, sigma_r, np.arange(len(free)) == 0
+    )
     acting = prior if preset.prior else replace(prior, information=0 * prior.information)
     clock.lap("prepare")
 
@@ -123,7 +127,9 @@ def _register(
     for index, spacing in enumerate(levels):
         level = make_level(problem, poses, spacing, preset, options)
         heights = level_heights(level, heights, previous)
-        state, lin = solve_map(level.problem, level.grid, State(poses, heights), level.loss, level.smooth, workers, 1)
+        state, lin = solve_map(
+            level.problem, level.grid, State(poses, heights), level.loss, level.smooth, workers, 1
+        )
         for phase in phases(index, preset):
             last = index == len(levels) - 1 and (phase == "robust" or not preset.robust)
             rules = Rules(
@@ -138,8 +144,12 @@ def _register(
                 ).inflation
                 temperature = factor * robust_sigma(lin.residuals) ** 2
 
-            def report(p: Progress, level: Level = level, index: int = index, phase: str = phase) -> None:
-                history.append(_iteration(p, level, index, len(levels), phase, len(history), problem, clock))
+            def report(
+                p: Progress, level: Level = level, index: int = index, phase: str = phase
+            ) -> None:
+                history.append(
+                    _iteration(p, level, index, len(levels), phase, len(history), problem, clock)
+                )
                 callback(history[-1])
 
             outcome = solve_level(
@@ -157,19 +167,28 @@ def _register(
 
 
 def _scale(preset: schedule.Preset, phase: str) -> float:
-    """Return the robust scale of a phase, in robust standard deviations; 0 without a robust loss."""
+    """Return the robust scale of a phase, in robust standard deviations.
+
+    0 without a robust loss.
+    """
     return min(preset.robust, WIDE) if phase == "robust" else WIDE if preset.robust else 0.0
 
 
 def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
-    """Return the losses of a level: the robust one comes only when the poses have settled under a wide one."""
+    """Return the losses of a level.
+
+    The robust one comes only when the poses have settled under a wide one.
+    """
     if not preset.robust:
         return ("quadratic",)
     return ("quadratic", "robust") if index == 0 else ("robust",)
 
 
 def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
-    """Return (N, 4, 4) T_world_camera to start from: measured, identity, or a TUM file joined by stamp."""
+    """Return (N, 4, 4) T_world_camera to start from.
+
+    Measured, identity, or a TUM file joined by stamp.
+    """
     measured = dataset.T_world_camera_measured
     if init == "measured":
         return measured
@@ -182,7 +201,9 @@ def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
     for frame in dataset:
         near = np.flatnonzero(np.abs(stamps - frame.stamp) <= 1e-6)
         if len(near) != 1:
-            raise OptionError(f"--init {init}: {len(near)} poses for frame {frame.id} at stamp {frame.stamp:.6f}")
+            raise OptionError(
+                f"--init {init}: {len(near)} poses for frame {frame.id} at stamp {frame.stamp:.6f}"
+            )
         found.append(poses[near[0]])
     return np.stack(found)
 
@@ -190,7 +211,10 @@ def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
 def pose_sigmas(
     dataset: Dataset, options: Options
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the standard deviations (3,) m and (3,) rad of the measured poses: options, dataset, or usual ones."""
+    """Return the standard deviations (3,) m and (3,) rad of the measured poses.
+
+    Options, dataset, or usual ones.
+    """
     noise = dataset.pose_noise
     sigma_t = np.array(noise.sigma_t_m if noise else (USUAL_T,) * 3, dtype=float)
     sigma_r = np.array(noise.sigma_r_rad if noise else (USUAL_R,) * 3, dtype=float)
@@ -219,13 +243,22 @@ def make_level(
     seen = averages.count > 0
     smooth = np.ones(grid.shape, bool) if preset.whole else near(seen, 3)
     typical = float(np.median(averages.count[seen])) if seen.any() else 1.0
-    return Level(problem, grid, averages, smooth, schedule.loss_for(preset, options, problem, spacing, typical))
+    return Level(
+        problem,
+        grid,
+        averages,
+        smooth,
+        schedule.loss_for(preset, options, problem, spacing, typical),
+    )
 
 
 def level_heights(
     level: Level, heights: NDArray[np.float64] | None, previous: Grid | None
 ) -> NDArray[np.float64]:
-    """Return the heights that a level starts from: averages, and the coarser map where nothing fell."""
+    """Return the heights that a level starts from.
+
+    Averages, and the coarser map where nothing fell.
+    """
     if heights is None or previous is None:
         return filled(level.averages.heights)
     return resample(heights, previous, level.grid)
@@ -239,12 +272,15 @@ def _conclude(
 ) -> Result:  # fmt: skip
     """Compare with the start, say how certain the outcome is, and put the result together."""
     T_camera_start = problem.T_map_camera
+    averages = average(problem, T_camera_start, level.grid)
     began, began_lin = solve_map(
-        level.problem, level.grid, State(T_camera_start, filled(average(problem, T_camera_start, level.grid).heights)),
+        level.problem, level.grid, State(T_camera_start, filled(averages.heights)),
         outcome.loss, level.smooth, workers, 3,
     )  # fmt: skip
     acting = temperature if preset.prior else 0.0
-    outcome_lin = linearise(level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth)
+    outcome_lin = linearise(
+        level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth
+    )
     cost_start = began_lin.cost + acting * prior.cost(T_camera_start)
     cost_end = outcome_lin.cost + acting * prior.cost(outcome.state.T_map_camera)
     better = cost_end <= cost_start
@@ -295,7 +331,8 @@ def verdict(
         parts = [f"frame {f.frame} was held: {f.held}" for f in starved]
         if weak:
             parts.append(
-                f"the data leave {len(judged.weak)} directions of {len(weak)} frames to the measured poses"
+                f"the data leave {len(judged.weak)} directions of {len(weak)} frames "
+                "to the measured poses"
             )
         return "weak", "; ".join(parts)
     if not outcome.converged:
@@ -343,7 +380,8 @@ def _depth_map(
 
 
 def _iteration(
-    p: Progress, level: Level, index: int, levels: int, phase: str, count: int, problem: Problem, clock: Clock
+    p: Progress, level: Level, index: int, levels: int, phase: str, count: int,
+    problem: Problem, clock: Clock,
 ) -> Iteration:  # fmt: skip
     weights = np.concatenate([w[:: max(1, len(w) // 5000)] for w in p.lin.weights])
     seen = near(level.averages.count > 0, 1)

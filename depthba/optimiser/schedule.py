@@ -12,7 +12,8 @@ from depthba.optimiser.linearise import Loss
 from depthba.optimiser.problem import Problem
 from depthba.options import Options
 
-# Slope that noise alone may put into the map: above it the gradient, and with it the poses, are biased.
+# Slope that noise alone may put into the map: above it the gradient, and with it the poses, are
+# biased.
 NOISE_SLOPE = 0.02
 # The coarsest cells are this many times the distance by which the start poses may displace a point.
 REACH = 1.5
@@ -40,10 +41,12 @@ class Preset:
 
 PRESETS = {
     "paper": Preset(
-        along_ray=False, slope=False, robust=0.0, smoothing=0.1, relative=False, whole=True, prior=False
+        along_ray=False, slope=False, robust=0.0,
+        smoothing=0.1, relative=False, whole=True, prior=False,
     ),
     "default": Preset(
-        along_ray=True, slope=True, robust=3.5, smoothing=1e-4, relative=True, whole=False, prior=True
+        along_ray=True, slope=True, robust=3.5,
+        smoothing=1e-4, relative=True, whole=False, prior=True,
     ),
 }  # fmt: skip
 
@@ -60,7 +63,9 @@ def check(options: Options) -> None:
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):
             raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected a number above 0")
-    if options.smoothing is not None and not (np.isfinite(options.smoothing) and options.smoothing > 0):
+    if options.smoothing is not None and not (
+        np.isfinite(options.smoothing) and options.smoothing > 0
+    ):
         raise OptionError(f"--smoothing {options.smoothing:g}: expected a number above 0")
     for name in ("threads", "max_iterations"):
         value = getattr(options, name)
@@ -71,8 +76,9 @@ def check(options: Options) -> None:
 def finest_spacing(problem: Problem) -> float:
     """Return the map spacing that the data call for, m.
 
-    Near the spacing of the points, but no finer than noise allows: n points of deviation sigma on a cell of size s leave
-    a slope of sigma / (s sqrt(n)) in the map, and n grows with s^2 times the points' density.
+    Near the spacing of the points, but no finer than noise allows: n points of deviation sigma on a
+    cell of size s leave a slope of sigma / (s sqrt(n)) in the map, and n grows with s^2 times the
+    points' density.
     """
     if problem.noise is None:
         return 4 * problem.spacing
@@ -97,11 +103,16 @@ def spacings(
 
 
 def stride(problem: Problem, spacing: float) -> int:
-    """Return which share of the points a level needs: every how-manieth one leaves a frame enough on a node."""
+    """Return which share of the points a level needs.
+
+    Every how-manieth one leaves a frame enough on a node.
+    """
     return max(1, int((spacing / problem.spacing) ** 2 / ENOUGH))
 
 
-def loss_for(preset: Preset, options: Options, problem: Problem, spacing: float, data: float) -> Loss:
+def loss_for(
+    preset: Preset, options: Options, problem: Problem, spacing: float, data: float
+) -> Loss:
     """Return the residual of a level; ``data`` is the weight of the points on a typical node."""
     smoothing = options.smoothing if options.smoothing is not None else preset.smoothing
     return Loss(

@@ -1,7 +1,8 @@
 """Levenberg-Marquardt over poses and map on one grid.
 
-A step is judged on the whole cost, smoothing and priors included, at the robust scale where it was linearised and over
-all points: one that is not on the map pays for it, so nothing looks better by losing points.
+A step is judged on the whole cost, smoothing and priors included, at the robust scale where it was
+linearised and over all points: one that is not on the map pays for it, so nothing looks better by
+losing points.
 """
 
 from __future__ import annotations
@@ -24,14 +25,16 @@ class Rules:
     """How a level is solved."""
 
     robust: float
-    """Scale of the Geman-McClure loss in robust standard deviations of the residuals; 0: no robust loss."""
+    """Scale of the Geman-McClure loss in robust standard deviations of the residuals; 0: no robust
+    loss."""
     limit: int
     """Most iterations."""
     settled: float = 0.1
-    """Converged when the step is below this many standard deviations of the poses (root mean square)."""
+    """Converged when the step is below this many standard deviations of the poses (root mean
+    square)."""
     gain: float = 0.0
-    """Enough when a step lowers the cost by less than this share: a coarse level only has to bring the next into
-    reach."""
+    """Enough when a step lowers the cost by less than this share: a coarse level only has to bring
+    the next into reach."""
     tolerance: float = 1e-2
     """Relative residual at which the correction of the lumped step stops."""
     outer: int = 12
@@ -102,8 +105,8 @@ def solve_level(
         loss: the residual; its robust scale is set here as the residuals fall.
         rules: how to iterate.
         prior: the measured poses.
-        temperature: m^2, what a squared normalised prior error costs: the residuals' variance, times the factor by
-            which their correlation over the image exaggerates what they know.
+        temperature: m^2, what a squared normalised prior error costs: the residuals' variance,
+            times the factor by which their correlation over the image exaggerates what they know.
         free: (N,) frames that move.
         smooth: (ny, nx) nodes under the smoothing term.
         workers: the threads.
@@ -120,9 +123,7 @@ def solve_level(
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
         step = eliminate.solve(lin, free, believed, damping, workers, rules.tolerance, rules.outer)
-        candidate = State(
-            move(state.T_map_camera, lin.pivots, step.pose), state.heights + step.map
-        )
+        candidate = State(move(state.T_map_camera, lin.pivots, step.pose), state.heights + step.map)
         after = linearise(problem, grid, candidate, loss, workers, smooth, judge)
         before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
         after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
@@ -132,7 +133,9 @@ def solve_level(
         if accepted:
             state, lin, judge = candidate, after, loss
             sigma = robust_sigma(lin.residuals)
-            loss = _rescaled(loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma)
+            loss = _rescaled(
+                loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma
+            )
             damping = damping / 10 if damping > 1e-6 else 0.0
         else:
             damping = max(10 * damping, 1e-4)

@@ -1,8 +1,13 @@
-"""The map's block of the normal equations: a symmetric nine-point stencil, and conjugate gradients on it.
+"""The map's block of the normal equations.
 
-Points couple the four nodes of their cell, so a node is coupled to its eight neighbours. Where there are data the
-block is like a mass matrix and Jacobi-preconditioned conjugate gradients converge in tens of iterations.
+A symmetric nine-point stencil, and conjugate gradients on it.
+
+Points couple the four nodes of their cell, so a node is coupled to its eight neighbours. Where
+there are data the block is like a mass matrix and Jacobi-preconditioned conjugate gradients
+converge in tens of iterations.
 """
+
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 
 from __future__ import annotations
 
@@ -51,11 +56,20 @@ class Stencil:
         total[1:, :-1] += up_left[:-1, :-1]
         return total
 
+    def window(self, y: slice, x: slice) -> Stencil:
+        """Return the matrix over a window of the nodes, as if all others were held at zero."""
+        return Stencil(
+            *(
+                np.ascontiguousarray(f[y, x])
+                for f in (self.own, self.right, self.up, self.up_right, self.up_left)
+            )
+        )
+
     def solve(self, b: Field, tolerance: float = 1e-6, limit: int = 500) -> tuple[Field, int]:
         """Solve for one right-hand side (ny, nx) by Jacobi-preconditioned conjugate gradients.
 
-        ``tolerance`` bounds the residual relative to ``b`` in the norm of the preconditioner. Returns the solution
-        and the number of iterations.
+        ``tolerance`` bounds the residual relative to ``b`` in the norm of the preconditioner.
+        Returns the solution and the number of iterations.
         """
         x = np.zeros_like(b)
         n = _conjugate_gradients(
@@ -81,27 +95,54 @@ class Stencil:
         return sp.csc_matrix(upper + upper.T + sp.diags(self.own.ravel()))
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
+def _border(own, right, up, up_right, up_left, v, y, x):
+    """Return the product at a node on the border of the grid."""
+    ny, nx = own.shape
+    total = own[y, x] * v[y, x]
+    if x + 1 < nx:
+        total += right[y, x] * v[y, x + 1]
+    if x > 0:
+        total += right[y, x - 1] * v[y, x - 1]
+    if y + 1 < ny:
+        total += up[y, x] * v[y + 1, x]
+        if x + 1 < nx:
+            total += up_right[y, x] * v[y + 1, x + 1]
+        if x > 0:
+            total += up_left[y, x - 1] * v[y + 1, x - 1]
+    if y > 0:
+        total += up[y - 1, x] * v[y - 1, x]
+        if x > 0:
+            total += up_right[y - 1, x - 1] * v[y - 1, x - 1]
+        if x + 1 < nx:
+            total += up_left[y - 1, x] * v[y - 1, x + 1]
+    return total
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract"})
 def _times(own, right, up, up_right, up_left, v, out):
     ny, nx = own.shape
-    for y in range(ny):
-        for x in range(nx):
-            out[y, x] = own[y, x] * v[y, x]
-        for x in range(nx - 1):
-            out[y, x] += right[y, x] * v[y, x + 1]
-            out[y, x + 1] += right[y, x] * v[y, x]
-        if y > 0:
-            for x in range(nx):
-                out[y, x] += up[y - 1, x] * v[y - 1, x]
-            for x in range(nx - 1):
-                out[y, x + 1] += up_right[y - 1, x] * v[y - 1, x]
-                out[y, x] += up_left[y - 1, x] * v[y - 1, x + 1]
-        if y < ny - 1:
-            for x in range(nx):
-                out[y, x] += up[y, x] * v[y + 1, x]
-            for x in range(nx - 1):
-                out[y, x] += up_right[y, x] * v[y + 1, x + 1]
-                out[y, x + 1] += up_left[y, x] * v[y + 1, x]
+    for x in range(nx):
+        out[0, x] = _border(own, right, up, up_right, up_left, v, 0, x)
+        out[ny - 1, x] = _border(own, right, up, up_right, up_left, v, ny - 1, x)
+    for y in range(1, ny - 1):
+        out[y, 0] = _border(own, right, up, up_right, up_left, v, y, 0)
+        out[y, nx - 1] = _border(own, right, up, up_right, up_left, v, y, nx - 1)
+        here, below, above = v[y], v[y - 1], v[y + 1]
+        o, r, u, u0 = own[y], right[y], up[y], up[y - 1]
+        d, d0, a, a0 = up_right[y], up_right[y - 1], up_left[y], up_left[y - 1]
+        for x in range(1, nx - 1):
+            out[y, x] = (
+                o[x] * here[x]
+                + r[x] * here[x + 1]
+                + r[x - 1] * here[x - 1]
+                + u[x] * above[x]
+                + u0[x] * below[x]
+                + d[x] * above[x + 1]
+                + d0[x - 1] * below[x - 1]
+                + a[x - 1] * above[x - 1]
+                + a0[x] * below[x + 1]
+            )
 
 
 @nb.njit(cache=True, nogil=True)

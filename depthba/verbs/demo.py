@@ -17,7 +17,7 @@ from depthba.verbs.register import Outcome, register_into, removed_on_failure
 SCENE = "industrial-6"
 FRAMES, SIZE, START_ERROR = 21, (320, 240), (0.03, 0.02)
 
-METHODS = {"paper": Options(preset="paper", resolution=0.05), "default": Options()}
+METHODS = {"paper": Options(preset="paper", resolution=0.05), "default": Options(resolution=0.025)}
 """In the order in which they run."""
 SHOWN = "default"
 """The method whose run people look at."""
