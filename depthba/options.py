@@ -28,7 +28,7 @@ class Options:
     smoothing: float | None = None
     """Weight of the smoothing term against one point. None: the preset's own."""
     prior_t: float | None = None
-    """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.02
+    """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.01
     (paper: no prior)."""
     prior_r: float | None = None
     """Standard deviation of the measured rotations, rad. None: the dataset's pose_noise, else 0.02

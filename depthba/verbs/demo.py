@@ -17,6 +17,7 @@ from depthba.verbs.register import Outcome, register_into, removed_on_failure
 SCENE = "industrial-6"
 FRAMES, SIZE, START_ERROR = 21, (320, 240), (0.03, 0.02)
 
+PICTURE = "before_after.png"
 METHODS = {"paper": Options(preset="paper", resolution=0.05), "default": Options(resolution=0.025)}
 """In the order in which they run."""
 SHOWN = "default"
@@ -64,6 +65,8 @@ def run(arguments: Arguments) -> int:
             name: register_into(dataset, options, out / name, evaluate=True, record=name == SHOWN)
             for name, options in METHODS.items()
         }
+        picture = importlib.import_module("depthba.picture")
+        picture.before_after(outcomes[SHOWN].result, dataset, out / PICTURE)
     scores = _scores(outcomes)
     if arguments.json:
         print_json({"methods": {name: vars(score) for name, score in scores.items()}})
@@ -118,7 +121,8 @@ def _show(scores: dict[str, Score], shown: Outcome, out: Path) -> None:
         )
     # a pipe has no width of its own, and a table must not be cut there
     Console(width=None if sys.stdout.isatty() else 100).print(table)
-    print(f"  picture    {shown.run / 'map.png'}")
+    print(f"  picture    {out / PICTURE}")
+    print(f"  map        {shown.run / 'map.png'}")
     if shown.recording is not None:
         print(f"  recording  {shown.recording}")
         print(f"             depthba review {shown.run}  opens it")
