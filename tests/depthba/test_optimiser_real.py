@@ -1,0 +1,84 @@
+"""The registration on the datasets that lie beside the checkout, where they do."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import depthba
+from depthba import se3
+from depthba.dataset import Dataset
+from depthba.options import Options
+from depthba.result import Result
+from depthba.trajectory import write_tum
+
+SHARED = Path(__file__).parents[3] / "shared"
+
+
+def opened(name: str) -> Dataset:
+    if not (SHARED / "data" / name).is_dir():
+        pytest.skip(f"{SHARED.name}/data/{name} is not beside this checkout")
+    return Dataset.open(SHARED / "data" / name)
+
+
+def scores(dataset: Dataset, T_world_camera: np.ndarray, folder: Path) -> dict[str, float]:
+    """Return what the independent scorer says of poses: spread and point to plane, m."""
+    tool = SHARED / "tools" / "score.py"
+    if not tool.is_file():
+        pytest.skip(f"{SHARED.name}/tools/score.py is not beside this checkout")
+    write_tum(folder / "poses.txt", np.asarray(dataset.stamps), T_world_camera)
+    command = [
+        sys.executable,
+        tool,
+        dataset.path,
+        folder / "poses.txt",
+        "--cell",
+        "0.005",
+        "--json",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    found: dict[str, float] = json.loads(done.stdout)["map"]
+    return found
+
+
+def largest_move(result: Result) -> float:
+    moved = result.T_world_camera - result.T_world_camera_start
+    return float(np.linalg.norm(moved[:, :3, 3], axis=1).max())
+
+
+def test_bumpy_reaches_the_noise() -> None:
+    dataset = opened("bumpy-a")
+    result = depthba.register(dataset)
+    truth = dataset.T_world_camera_true
+    assert truth is not None
+    error = np.abs(se3.difference(se3.align_first(result.T_world_camera, truth), truth)[1:])
+    assert result.trusted
+    assert error[:, :3].mean() < 0.0002 and error[:, 3:].mean() < 0.0004
+
+
+@pytest.mark.slow
+def test_tray_is_aligned_and_does_not_slide(tmp_path: Path) -> None:
+    """A bare table under a tray: frames could slide along it without anything to tell."""
+    dataset = opened("ur5-tabletop-tray")
+    result = depthba.register(dataset, Options(roi=(-0.45, 0.05, -0.6, -0.05, -0.1, 0.3)))
+    found = scores(dataset, result.T_world_camera, tmp_path)
+    assert found["z_mad_median_m"] <= 0.0013
+    assert found["p2plane_median_m"] <= 0.0015
+    assert largest_move(result) <= 0.060
+    assert not result.trusted and any("turn about z" in w.name for w in result.weak)
+
+
+@pytest.mark.slow
+def test_box_is_aligned_though_its_walls_hold_two_heights(tmp_path: Path) -> None:
+    dataset = opened("realsense-box")
+    result = depthba.register(dataset)
+    start = scores(dataset, result.T_world_camera_start, tmp_path)
+    found = scores(dataset, result.T_world_camera, tmp_path)
+    assert found["z_mad_median_m"] <= 0.0041
+    assert found["p2plane_median_m"] <= start["p2plane_median_m"]
+    assert largest_move(result) <= 0.015
