@@ -28,6 +28,8 @@ class Correlation:
     """Factor on the variance of the poses, at least 1."""
     S: NDArray[np.float64]
     """(6N, 6N), exact reduced matrix that it was measured with."""
+    owed: float
+    """Largest share that the measured poses have in any direction of the estimate, 0 to 1."""
 
 
 def correlation(
@@ -53,7 +55,7 @@ def correlation(
     S = eliminate.exact(lin, workers, tolerance)
     keep = np.repeat(free, 6)
     if not keep.any():
-        return Correlation(1.0, S)
+        return Correlation(1.0, S, 0.0)
     inner = S[np.ix_(keep, keep)]
     P = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])[np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
@@ -70,7 +72,8 @@ def correlation(
         V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, spread[0] / max(spread[1], 1e-300))
-    return Correlation(factor, S)
+    T = max(factor * variance, 1e-30)
+    return Correlation(factor, S, float(eigh(T * P, inner + T * P, eigvals_only=True)[-1]))
 
 
 def block_scores(
@@ -90,6 +93,11 @@ def block_scores(
     nodes = np.empty((*grid.shape, 3))
     kernels.nodal_gradients(state.heights, grid.spacing, nodes)
     fronts = fronts_of(problem, state.T_map_camera)
+    count = BLOCKS[0] * BLOCKS[1]
+    order = [np.argsort(b, kind="stable") for b in blocks]
+    first = [
+        np.searchsorted(b[o], np.arange(count + 1)) for b, o in zip(blocks, order, strict=True)
+    ]
 
     def score(block: int) -> NDArray[np.float64]:
         g, field = np.zeros((len(problem.frames), 6)), np.zeros(grid.shape)
@@ -97,12 +105,12 @@ def block_scores(
             kernels.block_gradient(
                 frame.points, T[:3, :3].copy(), T[:3, 3].copy(), T[:3, 3] - lin.pivots[i],
                 grid.origin, grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap,
-                lin.weights[i], blocks[i], block, g[i], field,
+                lin.weights[i], order[i][first[i][block] : first[i][block + 1]], g[i], field,
             )  # fmt: skip
         answer, _ = lin.C.solve(-field, tolerance)
         return (g + eliminate.gather(lin, answer)).ravel()
 
-    return np.stack(workers.map(score, range(BLOCKS[0] * BLOCKS[1])))
+    return np.stack(workers.map(score, range(count)))
 
 
 @dataclass(frozen=True)

@@ -189,11 +189,11 @@ def accumulate(
 @nb.njit(cache=True, nogil=True)
 def block_gradient(
     points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
-    weights, blocks, block, g, gradient,
+    weights, members, g, gradient,
 ):  # fmt: skip
-    """Add what one image block contributes to ``g`` (6,) and to the map's ``gradient`` (ny, nx)."""
-    for k in range(points.shape[0]):
-        if blocks[k] != block or weights[k] <= 0.0:
+    """Add what the points ``members`` contribute to ``g`` (6,) and to ``gradient`` (ny, nx)."""
+    for k in members:
+        if weights[k] <= 0.0:
             continue
         on, x, y, a, b, qx, qy, qz, r, norm, gx, gy = _residual(
             points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,

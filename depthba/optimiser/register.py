@@ -35,6 +35,9 @@ USUAL_T, USUAL_R = 0.01, 0.02
 WIDE = 12.0
 # A level that only leads to the next is left when a step gains less than this share of its cost.
 GAIN = 0.02
+# Where the estimate owes the measured poses less than this in every direction, their exact weight
+# is of no account.
+NEGLIGIBLE = 0.002
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ def _register(
     clock.lap("read")
     sigma_t, sigma_r = pose_sigmas(dataset, options)
     levels = schedule.spacings(options, problem, sigma_t, sigma_r)
+    make_grid(problem, levels[-1], 2 * levels[-1])  # too fine a map is refused before any work
     overlap = overlap_matrix(problem, problem.T_map_camera, levels[-1])
     held = held_frames(problem, overlap)
     free = np.array([not reason for reason in held])
@@ -123,6 +127,7 @@ def _register(
     clock.lap("prepare")
 
     history: list[Iteration] = []
+    known: certainty.Correlation | None = None
     poses, heights, previous = problem.T_map_camera, None, None
     for index, spacing in enumerate(levels):
         level = make_level(problem, poses, spacing, preset, options)
@@ -139,10 +144,11 @@ def _register(
             )
             temperature = 0.0
             if preset.prior:
-                factor = certainty.correlation(
-                    level.problem, level.grid, state, level.loss, lin, prior, free, workers
-                ).inflation
-                temperature = factor * robust_sigma(lin.residuals) ** 2
+                if known is None or known.owed > NEGLIGIBLE:
+                    known = certainty.correlation(
+                        level.problem, level.grid, state, level.loss, lin, prior, free, workers
+                    )
+                temperature = known.inflation * robust_sigma(lin.residuals) ** 2
 
             def report(
                 p: Progress, level: Level = level, index: int = index, phase: str = phase

@@ -149,10 +149,6 @@ def test_options_that_make_no_sense(scene: Dataset, options: dict[str, Any], nam
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
-@pytest.mark.skip(
-    reason="refused only at the level that is too fine, after minutes on those before"
-)
 def test_resolution_that_fits_no_memory(scene: Dataset) -> None:
     with pytest.raises(OptionError, match=r"--resolution 1e-06"):
         depthba.register(scene, Options(resolution=1e-6))
