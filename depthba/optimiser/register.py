@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.dataset import Dataset
-from depthba.depth_map import DepthMap
 from depthba.errors import OptionError
 from depthba.optimiser import certainty, schedule
-from depthba.optimiser.grid import Averages, Grid, average, filled, make_grid, near, resample
-from depthba.optimiser.layers import down_weighted
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
+from depthba.optimiser.grid import average, filled, make_grid
+from depthba.optimiser.level import Level, level_heights, make_level
+from depthba.optimiser.linearise import State, Workers, linearise, robust_sigma
 from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import PosePrior, pose_prior
 from depthba.optimiser.problem import Problem, prepare
+from depthba.optimiser.reporting import depth_map, frame_reports, iteration, verdict
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
 from depthba.options import Options
-from depthba.result import FrameReport, Iteration, Result, Status
+from depthba.result import Iteration, Result
 from depthba.trajectory import read_tum
 
 # Standard deviations of a measured pose where the dataset states none: a rig that was set up with
@@ -38,17 +38,6 @@ GAIN = 0.02
 # Where the estimate owes the measured poses less than this in every direction, their exact weight
 # is of no account.
 NEGLIGIBLE = 0.002
-
-
-@dataclass(frozen=True)
-class Level:
-    """One grid of the schedule, with everything that stays fixed on it."""
-
-    problem: Problem
-    grid: Grid
-    averages: Averages
-    smooth: NDArray[np.bool_]
-    loss: Loss
 
 
 @dataclass
@@ -154,7 +143,9 @@ def _register(
                 p: Progress, level: Level = level, index: int = index, phase: str = phase
             ) -> None:
                 history.append(
-                    _iteration(p, level, index, len(levels), phase, len(history), problem, clock)
+                    iteration(
+                        p, level, index, len(levels), phase, len(history), problem, clock.elapsed
+                    )
                 )
                 callback(history[-1])
 
@@ -205,12 +196,12 @@ def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
     stamps, poses = read_tum(init)[:2]
     found = []
     for frame in dataset:
-        near = np.flatnonzero(np.abs(stamps - frame.stamp) <= 1e-6)
-        if len(near) != 1:
+        same = np.flatnonzero(np.abs(stamps - frame.stamp) <= 1e-6)
+        if len(same) != 1:
             raise OptionError(
-                f"--init {init}: {len(near)} poses for frame {frame.id} at stamp {frame.stamp:.6f}"
+                f"--init {init}: {len(same)} poses for frame {frame.id} at stamp {frame.stamp:.6f}"
             )
-        found.append(poses[near[0]])
+        found.append(poses[same[0]])
     return np.stack(found)
 
 
@@ -231,43 +222,6 @@ def pose_sigmas(
     if options.prior_r is not None:
         sigma_r = np.full(3, options.prior_r)
     return sigma_t, sigma_r
-
-
-def make_level(
-    problem: Problem,
-    poses: NDArray[np.float64],
-    spacing: float,
-    preset: schedule.Preset,
-    options: Options,
-) -> Level:
-    """Lay the grid of a level and fix what stays fixed on it."""
-    problem = problem.thinned(schedule.stride(problem, spacing))
-    grid = make_grid(problem, spacing, 2 * spacing)
-    averages = average(problem, poses, grid)
-    if preset.robust:
-        problem = down_weighted(problem, poses, spacing)
-    seen = averages.count > 0
-    smooth = np.ones(grid.shape, bool) if preset.whole else near(seen, 3)
-    typical = float(np.median(averages.count[seen])) if seen.any() else 1.0
-    return Level(
-        problem,
-        grid,
-        averages,
-        smooth,
-        schedule.loss_for(preset, options, problem, spacing, typical),
-    )
-
-
-def level_heights(
-    level: Level, heights: NDArray[np.float64] | None, previous: Grid | None
-) -> NDArray[np.float64]:
-    """Return the heights that a level starts from.
-
-    Averages, and the coarser map where nothing fell.
-    """
-    if heights is None or previous is None:
-        return filled(level.averages.heights)
-    return resample(heights, previous, level.grid)
 
 
 def _conclude(
@@ -302,7 +256,7 @@ def _conclude(
         tuple(f.id for f in dataset),
     )  # fmt: skip
     clock.lap("certainty")
-    frames = _frame_reports(dataset, problem, state, lin, held, overlap)
+    frames = frame_reports(dataset, problem, state, lin, held, overlap)
     status, reason = verdict(outcome, better, judged, frames)
     T_world_map = se3.inverse(problem.T_map_world)
     return Result(
@@ -312,8 +266,8 @@ def _conclude(
         stamps=tuple(f.stamp for f in dataset),
         T_world_camera=T_world_map @ state.T_map_camera if better else start,
         T_world_camera_start=start,
-        depth_map=_depth_map(problem, level, state, lin, sigma),
-        depth_map_start=_depth_map(problem, level, began, began_lin, sigma),
+        depth_map=depth_map(problem, level, state, lin, sigma),
+        depth_map_start=depth_map(problem, level, began, began_lin, sigma),
         covariance=judged.covariance,
         sigma=sigma,
         inflation=factor,
@@ -322,99 +276,4 @@ def _conclude(
         frames=frames,
         seconds={**clock.stages, "total": clock.elapsed},
         overlap=overlap,
-    )
-
-
-def verdict(
-    outcome: Outcome, better: bool, judged: certainty.Certainty, frames: tuple[FrameReport, ...]
-) -> tuple[Status, str]:
-    """Say how the registration ended, in one word and one sentence."""
-    if not better:
-        return "no_better", "no poses better than the start were found; the start is returned"
-    starved = [f for f in frames[1:] if f.held]
-    weak = sorted({w.frame for w in judged.weak})
-    if starved or weak:
-        parts = [f"frame {f.frame} was held: {f.held}" for f in starved]
-        if weak:
-            parts.append(
-                f"the data leave {len(judged.weak)} directions of {len(weak)} frames "
-                "to the measured poses"
-            )
-        return "weak", "; ".join(parts)
-    if not outcome.converged:
-        return "not_converged", "the iterations ended before the poses settled"
-    return "converged", "the poses settled"
-
-
-def _frame_reports(
-    dataset: Dataset, problem: Problem, state: State, lin: Linearisation, held: list[str],
-    overlap: NDArray[np.float64],
-) -> tuple[FrameReport, ...]:  # fmt: skip
-    moved = se3.difference(state.T_map_camera, problem.T_map_camera)
-    reports = []
-    for i, frame in enumerate(dataset):
-        weights = lin.weights[i]
-        reports.append(
-            FrameReport(
-                frame=frame.id,
-                points=len(problem.frames[i]),
-                overlap=float(np.delete(overlap[i], i).max(initial=0.0)),
-                inliers=float((weights > 0.5).mean()) if len(weights) else 0.0,
-                move_t=float(np.linalg.norm(moved[i, :3])),
-                move_r=float(np.linalg.norm(moved[i, 3:])),
-                held=held[i],
-            )
-        )
-    return tuple(reports)
-
-
-def _depth_map(
-    problem: Problem, level: Level, state: State, lin: Linearisation, sigma: float
-) -> DepthMap:
-    averages = average(problem, state.T_map_camera, level.grid)
-    seen = near(averages.count > 0, 1) & (lin.C.own > 0)
-    heights = np.where(seen, state.heights, np.nan)
-    spread = np.where(seen, sigma / np.sqrt(lin.C.row_sums()), np.nan)
-    return DepthMap(
-        heights=heights,
-        origin=(float(level.grid.origin[0]), float(level.grid.origin[1])),
-        spacing=level.grid.spacing,
-        T_map_world=problem.T_map_world,
-        count=averages.count.astype(np.int64),
-        sigma=spread,
-    )
-
-
-def _iteration(
-    p: Progress, level: Level, index: int, levels: int, phase: str, count: int,
-    problem: Problem, clock: Clock,
-) -> Iteration:  # fmt: skip
-    weights = np.concatenate([w[:: max(1, len(w) // 5000)] for w in p.lin.weights])
-    seen = near(level.averages.count > 0, 1)
-    unknown = np.full(level.grid.shape, np.nan)
-    turned = np.linalg.norm(p.step.pose[:, 3:], axis=1).max()
-    return Iteration(
-        index=count,
-        level=index,
-        levels=levels,
-        spacing=level.grid.spacing,
-        phase="robust" if phase == "robust" else "quadratic",
-        cost=p.cost,
-        step_t=float(np.linalg.norm(p.step.pose[:, :3], axis=1).max()),
-        step_r=float(turned),
-        damping=p.damping,
-        accepted=p.accepted,
-        inliers=float((weights > 0.5).mean()),
-        sigma=p.sigma,
-        cells=int(seen.sum()),
-        seconds=clock.elapsed,
-        T_world_camera=se3.inverse(problem.T_map_world) @ p.state.T_map_camera,
-        depth_map=DepthMap(
-            heights=np.where(seen, p.state.heights, np.nan),
-            origin=(float(level.grid.origin[0]), float(level.grid.origin[1])),
-            spacing=level.grid.spacing,
-            T_map_world=problem.T_map_world,
-            count=level.averages.count.astype(np.int64),
-            sigma=unknown,
-        ),
     )
