@@ -42,7 +42,7 @@ def test_the_truth_is_exact(clean_bay: Path, bay_model: mujoco.MjModel) -> None:
         short = (1.0 - scene.cast(eye, towards).distance) * length
         assert np.median(np.abs(short)) < 5e-5
         assert np.mean(short < -1e-3) < 0.01  # it may slip past an edge, but not through
-        assert 0.01 < np.mean(short > 5e-3) < 0.35  # and rubble does hide some
+        assert 0.003 < np.mean(short > 5e-3) < 0.35  # and rubble does hide some
 
 
 def test_clean_poses_are_true_and_gantry_like(clean_bay: Path) -> None:
@@ -110,13 +110,13 @@ def test_markers_are_seen_where_they_are(noisy_bay: Path, clean_bay: Path) -> No
     assert not np.array_equal(before, markers["origin"].observations[0][1])  # noise included
 
 
-def test_the_plate_lies_tilted_on_the_rubble(bay_model: mujoco.MjModel) -> None:
+def test_the_plate_lies_bedded_in_the_rubble(bay_model: mujoco.MjModel) -> None:
     data = mujoco.MjData(bay_model)
     mujoco.mj_kinematics(bay_model, data)
     plate = [k for k in range(bay_model.ngeom) if bay_model.geom(k).name.startswith("plate_")]
     up = data.geom_xmat[plate].reshape(-1, 3, 3)[:, 2, 2]
-    assert 0.5 < np.degrees(np.arccos(up[0])) < 15.0
-    assert len(plate) >= 6 and np.ptp(np.degrees(np.arccos(up))) > 15.0  # several planes
+    assert np.degrees(np.arccos(up[0])) < 5.0
+    assert len(plate) >= 6 and np.ptp(np.degrees(np.arccos(up))) > 2.0  # several planes
     scene = RayScene.of_model(bay_model)
     corner = data.geom_xpos[plate[0]] + data.geom_xmat[plate[0]].reshape(3, 3)[:, 1] * (
         bay_model.geom_size[plate[0], 1] - 0.05
