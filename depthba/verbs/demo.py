@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +61,12 @@ def run(arguments: Arguments) -> int:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out}: is in the way, expected a new or empty folder")
     with removed_on_failure(out, overwrite=False):
-        dataset = Dataset.open(_generate(out / "dataset", arguments.seed))
+        # the kernels compile on one core while the scene is rendered on the other
+        compiling = subprocess.Popen([sys.executable, "-m", "depthba.optimiser.warm"])
+        try:
+            dataset = Dataset.open(_generate(out / "dataset", arguments.seed))
+        finally:
+            compiling.wait()
         outcomes = {
             name: register_into(dataset, options, out / name, evaluate=True, record=name == SHOWN)
             for name, options in METHODS.items()
