@@ -31,7 +31,7 @@ class Iteration:
     phase: Literal["quadratic", "robust"]
     """Whether the robust loss is on."""
     cost: float
-    """Total cost before the step, in units of the residual variance of the level's start."""
+    """Total cost before the step, priors and smoothing included, m^2."""
     step_t: float
     """Largest translation of a frame in this step, m."""
     step_r: float

@@ -54,10 +54,7 @@ def make_level(
 def level_heights(
     level: Level, heights: NDArray[np.float64] | None, previous: Grid | None
 ) -> NDArray[np.float64]:
-    """Return the heights that a level starts from.
-
-    Averages, and the coarser map where nothing fell.
-    """
+    """Return the heights that a level starts from: the coarser map, or averages on the first."""
     if heights is None or previous is None:
         return filled(level.averages.heights)
     return resample(heights, previous, level.grid)

@@ -168,7 +168,9 @@ def _scale(preset: schedule.Preset, phase: str) -> float:
 
     0 without a robust loss.
     """
-    return min(preset.robust, WIDE) if phase == "robust" else WIDE if preset.robust else 0.0
+    if not preset.robust:
+        return 0.0
+    return preset.robust if phase == "robust" else WIDE
 
 
 def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
