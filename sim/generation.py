@@ -17,12 +17,13 @@ from depthba.durable import write_json, write_text
 from depthba.errors import DatasetError, OptionError
 from sim.engine import mujoco
 from sim.markers import discs_of, observe
-from sim.noise import Shot, choose_stages, measure
-from sim.raycast import RayScene
-from sim.rigs import Track, find_rig
+from sim.noise import choose_stages, measure
+from sim.noise.shot import Shot
+from sim.rigs import find_rig
+from sim.rigs.track import Track
 from sim.scenes import Scene, find_scene
 from sim.sensors import DepthSensor, find_sensor
-from sim.shading import Painter
+from sim.world import World
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -81,27 +82,23 @@ def generate(
         sensor = sensor.resized(*options.size)
     stages = choose_stages(options.clean, options.without)
     scale = 0.0 if options.clean else options.pose_noise
-    track = find_rig(entry.rig).track(options.seed, options.frames, options.start_error, scale)
-    header = _header(entry, sensor, track, options)
-    writer, done = _open(out, header)
-
-    report(done, len(track.stamps), "building the scene")
-    # What is rendered is the text that is stored, rounded digits and all.
-    xml = entry.build(options.seed).to_xml()
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    _store_scene(out, entry, options, xml)
-    scene_rays = RayScene.of_model(model, data)
-    painter = Painter(scene_rays, model)
-    discs = discs_of(model, data)
+    report(0, 0, "building the scene")
+    world = World.build(entry, options.seed)
+    track = find_rig(entry.rig).track(
+        world.model, options.seed, options.frames, options.start_error, scale
+    )
+    writer, done = _open(out, _header(entry, sensor, track, options))
+    _store_scene(out, entry, options, world)
+    discs = discs_of(world.model, world.at().data)
     seen: dict[str, list[tuple[int, Array]]] = {disc.name: [] for disc in discs}
 
     camera, total = sensor.camera, len(track.stamps)
-    shot = Shot(sensor, camera.rays())
+    report(done, total, "rendering")
     for k in range(total):
         T_true = track.T_world_camera_true[k]
-        hits = scene_rays.view(camera, T_true)
+        view = world.at(None if track.qpos is None else track.qpos[k])
+        hits = view.rays.view(camera, T_true)
+        shot = Shot(sensor, view.rays, world.finish, T_true, hits)
         depth = measure(hits.distance, shot, options.seed, k, stages)
         for disc in discs:
             p_camera = observe(disc, camera, T_true, hits, depth)
@@ -112,9 +109,10 @@ def generate(
         writer.add_frame(
             stamp=float(track.stamps[k]),
             depth=depth,
-            rgb=painter.paint(camera, T_true, hits) if options.rgb else None,
+            rgb=view.painter.paint(camera, T_true, hits) if options.rgb else None,
             T_world_camera=track.T_world_camera[k],
             T_world_camera_true=T_true,
+            joints=None if track.joints is None else track.joints[k],
             T_base_flange=None if track.T_base_flange is None else track.T_base_flange[k],
         )
         report(k + 1, total, "rendering")
@@ -180,10 +178,10 @@ def _open(out: Path, header: dict[str, Any]) -> tuple[DatasetWriter, int]:
     return writer, len(Dataset.open(out))
 
 
-def _store_scene(out: Path, entry: Scene, options: GenerateOptions, xml: str) -> None:
+def _store_scene(out: Path, entry: Scene, options: GenerateOptions, world: World) -> None:
     folder = out / "scene"
     folder.mkdir(exist_ok=True)
-    write_text(folder / "scene.xml", xml)
+    write_text(folder / "scene.xml", world.xml)
     write_json(
         folder / "scene.json",
         {

@@ -37,6 +37,26 @@ def colours_of(model: mujoco.MjModel) -> Array:
     return np.where((material >= 0)[:, None], model.mat_rgba[np.maximum(material, 0), :3], own)
 
 
+@dataclass(frozen=True)
+class Finish:
+    """How the geoms of a model answer to light."""
+
+    reflectance: Array
+    """(ngeom,) diffuse, 0 black to 1 white."""
+    gloss: Array
+    """(ngeom,) 0 matt to 1 mirror: the material's specular times its shininess."""
+
+    @staticmethod
+    def of_model(model: mujoco.MjModel) -> Finish:
+        """From the geoms' colours and materials; a geom without a material is matt."""
+        reflectance = colours_of(model) @ [0.2126, 0.7152, 0.0722]
+        if model.nmat == 0:
+            return Finish(reflectance, np.zeros(model.ngeom))
+        material = np.asarray(model.geom_matid)
+        gloss = np.asarray(model.mat_specular * model.mat_shininess, float)
+        return Finish(reflectance, np.where(material >= 0, gloss[np.maximum(material, 0)], 0.0))
+
+
 class Painter:
     """Paints views of one scene; what depends on a triangle only is worked out once."""
 

@@ -9,19 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.errors import SimulationError
+from sim.noise.shot import Shot
 from sim.seeds import stream
-from sim.sensors import DepthSensor
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """What the stages may look at, beside the depth that they change."""
-
-    sensor: DepthSensor
-    rays: Array
-    """(height, width, 3) viewing rays with z = 1."""
 
 
 class Stage(Protocol):

@@ -1,8 +1,4 @@
-"""The rigs that carry the sensor: where they take frames, and how wrong their pose reports are.
-
-The truth is the exact grid; everything that a rig does not know about itself is in the reported
-poses. A rig's reports are `T_world_flange` (encoders) times the believed `T_flange_camera`.
-"""
+"""An X-Y gantry: where it takes frames, and how wrong its pose reports are."""
 
 from __future__ import annotations
 
@@ -13,31 +9,11 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.errors import OptionError
-from sim.errors import SimulationError
+from sim.engine import mujoco
+from sim.rigs.track import Track, Triple, perturbed, scaled
 from sim.seeds import stream
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Track:
-    """The poses of a capture."""
-
-    stamps: Array
-    """(N,) s."""
-    T_world_camera_true: Array
-    """(N, 4, 4)."""
-    T_world_camera: Array
-    """(N, 4, 4) as the rig reports them."""
-    sigma_t: Triple | None = None
-    """Believed standard deviation of the reported positions along world x, y, z, m; None: exact."""
-    sigma_r: Triple | None = None
-    """The same for rotations about world x, y, z, rad."""
-    T_base_flange: Array | None = None
-    """(N, 4, 4) as the encoders report it."""
-    T_flange_camera: Array | None = None
-    """(4, 4) the believed hand-eye transform."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +81,13 @@ class Gantry:
 
     def track(
         self,
+        model: mujoco.MjModel | None,
         seed: int,
         frames: int | None = None,
         start_error: tuple[float, float] | None = None,
         scale: float = 1.0,
     ) -> Track:
-        """The capture's poses.
+        """The capture's poses; the gantry itself is not in the model.
 
         `scale` multiplies the rig's errors (0: reports are exact). `start_error` (m, rad) replaces
         them by independent Gaussian errors per axis, frame 0 exact, for studies.
@@ -120,7 +97,7 @@ class Gantry:
         T_true = se3.make(np.broadcast_to(down, (len(stations), 3, 3)), stations)
         stamps = np.asarray(self.seconds * np.arange(len(stations)), np.float64)
         if start_error is not None:
-            return _perturbed(stamps, T_true, seed, start_error)
+            return perturbed(stamps, T_true, seed, start_error)
         if scale == 0.0:
             return Track(stamps, T_true, T_true)
         return self._reported(stamps, T_true, seed, scale)
@@ -129,8 +106,8 @@ class Gantry:
         rng = stream(seed, "gantry")
         errors, count = self.errors, len(stamps)
         # The carriage's flange hangs above the camera, level, with its axes along the world's.
-        T_flange_camera = se3.make(T_true[0, :3, :3], np.array([0.0, 0.0, -0.12]))
-        T_world_flange = T_true @ se3.inverse(T_flange_camera)
+        T_flange_camera_true = se3.make(T_true[0, :3, :3], np.array([0.0, 0.0, -0.12]))
+        T_world_flange = T_true @ se3.inverse(T_flange_camera_true)
         share = stamps / max(stamps[-1], 1.0)
         wave = np.sin(np.outer(share, [4.1, 5.3]) + rng.uniform(0.0, 6.3, 2))
         drift = share[:, None] + 0.5 * (wave - wave[0])
@@ -145,45 +122,15 @@ class Gantry:
         wrong[:3] = errors.hand_eye_t * rng.standard_normal(3)
         wrong[3:] = errors.hand_eye_r * rng.standard_normal(3)
         wrong[3:5] += errors.mounting_tilt * rng.standard_normal(2)
-        T_flange_camera = se3.retract(T_flange_camera, scale * wrong)
+        T_flange_camera = se3.retract(T_flange_camera_true, scale * wrong)
         sigma_t, sigma_r = errors.sigma()
         return Track(
             stamps,
             T_true,
             T_base_flange @ T_flange_camera,
-            _scaled(sigma_t, scale),
-            _scaled(sigma_r, scale),
-            T_base_flange,
-            T_flange_camera,
+            scaled(sigma_t, scale),
+            scaled(sigma_r, scale),
+            T_base_flange=T_base_flange,
+            T_flange_camera=T_flange_camera,
+            T_flange_camera_true=T_flange_camera_true,
         )
-
-
-def _perturbed(stamps: Array, T_true: Array, seed: int, start_error: tuple[float, float]) -> Track:
-    metres, radians = start_error
-    if not (np.isfinite(start_error).all() and metres >= 0.0 and radians >= 0.0):
-        raise OptionError(
-            f"start-error {metres} {radians}: expected two numbers of 0 or more (m, rad)"
-        )
-    delta = stream(seed, "start-error").standard_normal((len(stamps), 6))
-    delta *= np.repeat([metres, radians], 3)
-    delta[0] = 0.0
-    T = se3.retract(T_true, delta)
-    T[0] = T_true[0]
-    return Track(stamps, T_true, T, (metres,) * 3, (radians,) * 3)
-
-
-def _scaled(sigma: Triple, scale: float) -> Triple:
-    return (scale * sigma[0], scale * sigma[1], scale * sigma[2])
-
-
-RIGS: dict[str, Gantry] = {"gantry": Gantry()}
-
-
-def find_rig(name: str) -> Gantry:
-    """The rig called `name`; SimulationError lists the choices."""
-    try:
-        return RIGS[name]
-    except KeyError:
-        raise SimulationError(
-            f"unknown rig {name!r}; choose one of: {', '.join(sorted(RIGS))}"
-        ) from None

@@ -1,0 +1,53 @@
+"""A scene as it is rendered: the compiled model, and what rays meet at a pose of its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.engine import mujoco
+from sim.raycast import RayScene
+from sim.scenes import Scene
+from sim.shading import Finish, Painter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """A model at one pose of its joints."""
+
+    data: mujoco.MjData
+    rays: RayScene
+    painter: Painter
+
+
+class World:
+    """A compiled scene. What is rendered is the text that is stored, rounded digits and all."""
+
+    def __init__(self, xml: str, assets: Mapping[str, bytes]) -> None:
+        """Compile the scene's MJCF text, whose files are in `assets`."""
+        self.xml, self.assets = xml, dict(assets)
+        self.model = mujoco.MjModel.from_xml_string(xml, self.assets)
+        self.finish = Finish.of_model(self.model)
+        self._view: tuple[bytes, View] | None = None
+
+    @classmethod
+    def build(cls, entry: Scene, seed: int) -> World:
+        """The scene of a registry's entry."""
+        spec = entry.build(seed)
+        return cls(spec.to_xml(), dict(spec.assets))
+
+    def at(self, qpos: Array | None = None) -> View:
+        """The scene with its joints at `qpos` (nq,); None: as the model has them."""
+        qpos = self.model.qpos0 if qpos is None else np.asarray(qpos, float)
+        if self._view is None or self._view[0] != qpos.tobytes():
+            data = mujoco.MjData(self.model)
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(self.model, data)
+            rays = RayScene.of_model(self.model, data)
+            self._view = qpos.tobytes(), View(data, rays, Painter(rays, self.model))
+        return self._view[1]
