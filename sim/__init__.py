@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sim.errors import SimulationError
-    from sim.generation import GenerateOptions, Progress, generate
+    from sim.generation import Progress, generate, is_complete, rebuild
+    from sim.options import GenerateOptions
     from sim.raycast import RayScene
     from sim.scenes import SCENES, Scene
     from sim.sensors import SENSORS, DepthSensor
 
 _HOME = {
     "DepthSensor": "sim.sensors",
-    "GenerateOptions": "sim.generation",
+    "GenerateOptions": "sim.options",
     "Progress": "sim.generation",
     "RayScene": "sim.raycast",
     "SCENES": "sim.scenes",
@@ -25,6 +26,8 @@ _HOME = {
     "Scene": "sim.scenes",
     "SimulationError": "sim.errors",
     "generate": "sim.generation",
+    "is_complete": "sim.generation",
+    "rebuild": "sim.generation",
 }
 
 __all__ = [
@@ -37,6 +40,8 @@ __all__ = [
     "Scene",
     "SimulationError",
     "generate",
+    "is_complete",
+    "rebuild",
 ]
 
 

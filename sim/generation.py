@@ -1,10 +1,12 @@
-"""From a scene and a seed to a dataset folder: build, cast, measure, write."""
+"""From a scene and a seed to a dataset folder: plan, render, measure, write."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,105 +15,68 @@ from numpy.typing import NDArray
 
 from depthba import __version__
 from depthba.dataset import Dataset, DatasetWriter, Marker
-from depthba.durable import write_json, write_text
-from depthba.errors import DatasetError, OptionError
-from sim.engine import mujoco
+from depthba.durable import write_bytes, write_json, write_text
+from depthba.errors import DatasetError
+from sim.capture import Capture
 from sim.markers import discs_of, observe
-from sim.noise import choose_stages, measure
-from sim.noise.shot import Shot
-from sim.rigs import find_rig
-from sim.rigs.track import Track
+from sim.options import DEFAULTS, GenerateOptions
 from sim.scenes import Scene, find_scene
-from sim.sensors import DepthSensor, find_sensor
-from sim.world import World
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
-"""Called with frames done, frames in all, and what is being done."""
+"""Called with frames done, frames in all (0: not known yet), and what is being done."""
 
-
-@dataclass(frozen=True)
-class GenerateOptions:
-    """What to vary of a scene's dataset. Equal options give equal bytes."""
-
-    seed: int = 0
-    """Arrangement, noise and pose errors."""
-    frames: int | None = None
-    """Number of frames. None: the rig's own (industrial scenes: 21)."""
-    size: tuple[int, int] | None = None
-    """Image width and height, pixels. None: the sensor's own (SP1000: 1280 x 960)."""
-    start_error: tuple[float, float] | None = None
-    """Instead of the rig's pose errors: independent Gaussian errors per axis; frame 0 is exact.
-
-    The standard deviations, m and rad."""
-    clean: bool = False
-    """Leave all noise out, of the depth and of the poses; start_error still counts."""
-    pose_noise: float = 1.0
-    """Factor on the rig's pose errors."""
-    without: tuple[str, ...] = ()
-    """Stages of the sensor's noise to leave out, by name."""
-    rgb: bool = True
-    """Whether to render colour images too."""
-
-    def __post_init__(self) -> None:
-        """OptionError names a value that makes no sense."""
-        if self.seed < 0:
-            raise OptionError(f"seed {self.seed}: expected 0 or more")
-        if self.frames is not None and self.frames < 1:
-            raise OptionError(f"frames {self.frames}: expected 1 or more")
-        if not (np.isfinite(self.pose_noise) and self.pose_noise >= 0.0):
-            raise OptionError(f"pose_noise {self.pose_noise}: expected a factor of 0 or more")
+SCENE = "scene/scene.json"
+"""Written last: a dataset that has it is finished."""
 
 
 def generate(
     scene: str,
     out: str | Path,
-    options: GenerateOptions = GenerateOptions(),
+    options: GenerateOptions = DEFAULTS,
     progress: Progress | None = None,
 ) -> Path:
     """Render a scene into the dataset folder `out` and return its path.
 
-    A folder that holds the same dataset, cut short, is resumed. Raises SimulationError for an
-    unknown scene or stage, OptionError for a bad option, DatasetError where `out` holds anything
-    else.
+    `scene` is a name of `sim.SCENES`, the path of an MJCF file, or `module:function`. A folder that
+    holds the same dataset is left as it is; one that was cut short is resumed. Raises
+    SimulationError for an unknown scene, sensor, rig or stage, OptionError for a bad option,
+    DatasetError where `out` holds anything else.
     """
     report = progress or (lambda done, total, text: None)
     entry, out = find_scene(scene), Path(out)
-    sensor = find_sensor(entry.sensor)
-    if options.size is not None:
-        sensor = sensor.resized(*options.size)
-    stages = choose_stages(options.clean, options.without)
-    scale = 0.0 if options.clean else options.pose_noise
+    if is_complete(scene, out, options):
+        frames = len(Dataset.open(out))
+        report(frames, frames, "there already")
+        return out
     report(0, 0, "building the scene")
-    world = World.build(entry, options.seed)
-    track = find_rig(entry.rig).track(
-        world.model, options.seed, options.frames, options.start_error, scale
-    )
-    writer, done = _open(out, _header(entry, sensor, track, options))
-    _store_scene(out, entry, options, world)
-    discs = discs_of(world.model, world.at().data)
-    seen: dict[str, list[tuple[int, Array]]] = {disc.name: [] for disc in discs}
+    capture = Capture.plan(entry, options)
+    header = _header(scene, entry, capture)
+    writer, done = _open(out, header)
+    _store_assets(out, capture)
 
-    camera, total = sensor.camera, len(track.stamps)
+    discs = discs_of(capture.world.model, capture.world.at().data)
+    seen: dict[str, list[tuple[int, Array]]] = {disc.name: [] for disc in discs}
+    track, total = capture.track, len(capture)
     report(done, total, "rendering")
-    for k in range(total):
-        T_true = track.T_world_camera_true[k]
-        view = world.at(None if track.qpos is None else track.qpos[k])
-        hits = view.rays.view(camera, T_true)
-        shot = Shot(sensor, view.rays, world.finish, T_true, hits)
-        depth = measure(hits.distance, shot, options.seed, k, stages)
+    # Of frames committed before a crash only the markers are still needed.
+    for k in range(0 if discs else done, total):
+        taken = capture.expose(k, rgb=options.rgb and k >= done)
         for disc in discs:
-            p_camera = observe(disc, camera, T_true, hits, depth)
+            shot = taken.shot
+            p_camera = observe(
+                disc, capture.sensor.camera, shot.T_world_camera, shot.hits, taken.depth
+            )
             if p_camera is not None:
                 seen[disc.name].append((k, p_camera))
-        if k < done:  # committed before a crash; only its markers were still needed
+        if k < done:
             continue
         writer.add_frame(
             stamp=float(track.stamps[k]),
-            depth=depth,
-            rgb=view.painter.paint(camera, T_true, hits) if options.rgb else None,
+            depth=taken.depth,
+            rgb=taken.rgb,
             T_world_camera=track.T_world_camera[k],
-            T_world_camera_true=T_true,
+            T_world_camera_true=track.T_world_camera_true[k],
             joints=None if track.joints is None else track.joints[k],
             T_base_flange=None if track.T_base_flange is None else track.T_base_flange[k],
         )
@@ -120,13 +85,86 @@ def generate(
         writer.write_markers(
             [Marker(disc.name, disc.p_world, tuple(seen[disc.name])) for disc in discs]
         )
+    if capture.world.model.ntext:
+        from sim import calibration
+
+        board = calibration.of_model(capture.world.model, capture.world.at().data, track)
+        if board is not None:
+            writer.write_calibration(board)
+    write_json(
+        out / SCENE,
+        {"scene": scene, "seed": options.seed, "model": "scene.xml", "frames": total},
+    )
     return out
 
 
-def _header(
-    entry: Scene, sensor: DepthSensor, track: Track, options: GenerateOptions
-) -> dict[str, Any]:
-    camera, noise = sensor.camera, sensor.noise
+def is_complete(scene: str, out: str | Path, options: GenerateOptions) -> bool:
+    """Whether `out` holds this very dataset, finished; the images themselves are not read."""
+    out = Path(out)
+    if not (out / SCENE).is_file():
+        return False
+    try:
+        source = json.loads((out / "dataset.json").read_text(encoding="utf-8"))["source"]
+        frames = json.loads((out / SCENE).read_text(encoding="utf-8"))["frames"]
+        listed = (out / "frames.jsonl").read_bytes().count(b"\n")
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+    return bool(source == _source(scene, options)) and listed == frames
+
+
+def draw_stages(scene: str, path: str | Path, options: GenerateOptions, frame: int = 0) -> Path:
+    """Draw what each stage of the noise does to a frame, as a PNG; returns its path."""
+    from sim.contact_sheet import contact_sheet
+
+    capture = Capture.plan(find_scene(scene), options)
+    shot = capture.expose(frame, rgb=False).shot
+    title = f"{scene}, frame {frame}, {capture.sensor.model}"
+    contact_sheet(path, title, capture.sensor, capture.stages, shot, options.seed, frame)
+    return Path(path)
+
+
+def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = None) -> Path:
+    """Render a generated dataset anew from what it says about itself; equal bytes come out.
+
+    DatasetError where `dataset` was not generated, or with other versions than those here.
+    """
+    source = Dataset.open(dataset).header.get("source", {})
+    if not {"scene", "config", "versions"} <= source.keys():
+        raise DatasetError(f"{dataset}: dataset.json names no scene and config to rebuild it from")
+    if source["versions"] != _versions():
+        raise DatasetError(
+            f"{dataset}: made with {_listed(source['versions'])}, here are {_listed(_versions())};"
+            " expected the same"
+        )
+    config = {k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()}
+    return generate(source["scene"], out, GenerateOptions(**config), progress)
+
+
+def _source(scene: str, options: GenerateOptions) -> dict[str, Any]:
+    """Where the dataset comes from: all that decides its bytes."""
+    source: dict[str, Any] = {
+        "tool": "depthba generate",
+        "version": __version__,
+        "scene": scene,
+        "config": json.loads(json.dumps(asdict(options))),
+        "versions": _versions(),
+    }
+    if Path(scene).is_file():
+        source["scene_sha256"] = hashlib.sha256(Path(scene).read_bytes()).hexdigest()
+    return source
+
+
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in ("mujoco", "embreex", "numpy", "scipy")}
+
+
+def _listed(versions: dict[str, str]) -> str:
+    return ", ".join(f"{name} {number}" for name, number in versions.items())
+
+
+def _header(scene: str, entry: Scene, capture: Capture) -> dict[str, Any]:
+    sensor, track, options = capture.sensor, capture.track, capture.options
+    camera = sensor.camera
     header: dict[str, Any] = {
         "format": "depthba-dataset",
         "version": 1,
@@ -142,16 +180,10 @@ def _header(
         },
         "map_frame": "world",
         "seed": options.seed,
-        "source": {
-            "tool": "depthba generate",
-            "version": __version__,
-            "scene": entry.id,
-            "config": json.loads(json.dumps(asdict(options))),
-            "engine": f"mujoco {mujoco.__version__}",
-        },
+        "source": _source(scene, options),
     }
-    if not options.clean and "range-noise" not in options.without:
-        header["sensor"]["noise"] = asdict(noise)
+    if any(stage.name in ("range-noise", "disparity-noise") for stage in capture.stages):
+        header["sensor"]["noise"] = asdict(sensor.noise)
     if track.sigma_t is not None and track.sigma_r is not None:
         header["pose_noise"] = {
             "sigma_t_m": list(track.sigma_t),
@@ -178,16 +210,10 @@ def _open(out: Path, header: dict[str, Any]) -> tuple[DatasetWriter, int]:
     return writer, len(Dataset.open(out))
 
 
-def _store_scene(out: Path, entry: Scene, options: GenerateOptions, world: World) -> None:
+def _store_assets(out: Path, capture: Capture) -> None:
+    """Put the scene beside its frames: the model, and the files that it names."""
     folder = out / "scene"
     folder.mkdir(exist_ok=True)
-    write_text(folder / "scene.xml", world.xml)
-    write_json(
-        folder / "scene.json",
-        {
-            "scene": entry.id,
-            "seed": options.seed,
-            "model": "scene.xml",
-            "mujoco": mujoco.__version__,
-        },
-    )
+    write_text(folder / "scene.xml", capture.world.xml)
+    for name, data in sorted(capture.world.assets.items()):
+        write_bytes(folder / name, data)

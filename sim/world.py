@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,9 @@ from sim.engine import mujoco
 from sim.raycast import RayScene
 from sim.scenes import Scene
 from sim.shading import Finish, Painter
+
+if TYPE_CHECKING:
+    from sim.gl import GlRenderer
 
 Array = NDArray[np.float64]
 
@@ -36,9 +41,9 @@ class World:
         self._view: tuple[bytes, View] | None = None
 
     @classmethod
-    def build(cls, entry: Scene, seed: int) -> World:
+    def build(cls, entry: Scene, seed: int, settled: bool = False) -> World:
         """The scene of a registry's entry."""
-        spec = entry.build(seed)
+        spec = entry.build(seed, settled)
         return cls(spec.to_xml(), dict(spec.assets))
 
     def at(self, qpos: Array | None = None) -> View:
@@ -51,3 +56,10 @@ class World:
             rays = RayScene.of_model(self.model, data)
             self._view = qpos.tobytes(), View(data, rays, Painter(rays, self.model))
         return self._view[1]
+
+    @cached_property
+    def gl(self) -> GlRenderer:
+        """MuJoCo's own renderer, to compare with; MissingPackage where there is no OpenGL."""
+        from sim.gl import GlRenderer
+
+        return GlRenderer(self.model)

@@ -37,6 +37,7 @@ class Rig(Protocol):
 
 
 RIGS: dict[str, str] = {
+    "dome": "sim.rigs.dome:Dome",
     "gantry": "sim.rigs.gantry:Gantry",
 }
 """A class for each name, imported when it is wanted; called without arguments."""

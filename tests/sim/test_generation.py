@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,8 @@ import sim
 from depthba.cli import main
 from depthba.dataset import Dataset, verify
 from depthba.errors import DatasetError, DepthbaError, OptionError
+from sim.engine import mujoco
+from sim.errors import SimulationError
 
 OPTIONS = sim.GenerateOptions(seed=1, frames=4, size=(80, 60))
 
@@ -50,12 +53,96 @@ def test_a_dataset_cut_short_is_resumed_to_the_same_bytes(quick_scene: str, tmp_
     with pytest.raises(CrashError):
         sim.generate(quick_scene, tmp_path / "cut", OPTIONS, crash)
     assert len(Dataset.open(tmp_path / "cut")) == 2 and verify(tmp_path / "cut") == []
+    assert not sim.is_complete(quick_scene, tmp_path / "cut", OPTIONS)
     said: list[tuple[int, int]] = []
     sim.generate(quick_scene, tmp_path / "cut", OPTIONS, lambda k, n, text: said.append((k, n)))
     assert contents(tmp_path / "cut") == whole
-    assert said == [(2, 4), (3, 4), (4, 4)]
-    sim.generate(quick_scene, tmp_path / "cut", OPTIONS)  # finished: nothing to do
+    assert said == [(0, 0), (2, 4), (3, 4), (4, 4)]
+    assert sim.is_complete(quick_scene, tmp_path / "cut", OPTIONS)
+    said.clear()
+    sim.generate(quick_scene, tmp_path / "cut", OPTIONS, lambda k, n, text: said.append((k, n)))
+    assert said == [(4, 4)]  # finished: nothing to do
     assert contents(tmp_path / "cut") == whole
+    assert not sim.is_complete(quick_scene, tmp_path / "cut", replace(OPTIONS, seed=2))
+
+
+def test_a_dataset_is_rebuilt_from_what_it_says_of_itself(quick_scene: str, tmp_path: Path) -> None:
+    options = replace(OPTIONS, frames=2, start_error=(0.02, 0.01), without=("range-limits",))
+    first = sim.generate(quick_scene, tmp_path / "first", options)
+    assert contents(sim.rebuild(first, tmp_path / "again")) == contents(first)
+    header = json.loads((first / "dataset.json").read_text())
+    assert set(header["source"]["versions"]) == {"mujoco", "embreex", "numpy", "scipy"}
+    header["source"]["versions"]["numpy"] = "1.0"
+    (first / "dataset.json").write_text(json.dumps(header))
+    with pytest.raises(DatasetError, match=r"numpy 1\.0.*expected the same"):
+        sim.rebuild(first, tmp_path / "other")
+    del header["source"]["config"]
+    (first / "dataset.json").write_text(json.dumps(header))
+    with pytest.raises(DatasetError, match="no scene and config"):
+        sim.rebuild(first, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.fixture
+def own_model(tmp_path: Path) -> Path:
+    """An MJCF file with a mesh, a texture and a loose ball beside it."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "tent.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0.2 0.2 0.5\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
+    tile = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
+    assert cv2.imwrite(str(tmp_path / "tile.png"), tile)
+    model = tmp_path / "yard.xml"
+    model.write_text(
+        """<mujoco model="yard"><compiler meshdir="meshes"/><asset><mesh file="tent.obj"/>
+        <texture name="tile" type="2d" file="../tile.png"/><material name="m" texture="tile"/>
+        </asset><worldbody><geom type="plane" size="3 3 .1" material="m"/>
+        <geom type="mesh" mesh="tent" pos="0.1 0.2 0"/>
+        <body pos="-0.5 0 0.2"><freejoint/><geom size="0.2"/></body></worldbody></mujoco>"""
+    )
+    return model
+
+
+def test_an_mjcf_file_is_a_scene(own_model: Path, tmp_path: Path) -> None:
+    options = sim.GenerateOptions(seed=2, size=(160, 90), clean=True, frames=5, rgb=False)
+    path = sim.generate(str(own_model), tmp_path / "set", options)
+    assert verify(path) == []
+    dataset = Dataset.open(path)
+    assert dataset.header["name"] == "yard" and dataset.header["sensor"]["model"] == "zed2"
+    # What is stored compiles by itself, and the points lie on it.
+    model = mujoco.MjModel.from_xml_path(str(path / "scene" / "scene.xml"))
+    scene = sim.RayScene.of_model(model)
+    for k, frame in enumerate(dataset):
+        T = dataset.T_world_camera_true[k]
+        points = frame.points() @ T[:3, :3].T + T[:3, 3]
+        assert len(points) > 10_000
+        again = scene.cast(T[:3, 3], points - T[:3, 3]).distance
+        assert np.median(np.abs(again - 1.0)) * 2.0 < 5e-5
+    seen = np.concatenate([frame.depth().ravel() for frame in dataset])
+    assert np.ptp(seen[np.isfinite(seen)]) > 0.4  # ball and tent, not the floor alone
+
+
+def test_a_scene_of_ones_own_fails_in_one_line(own_model: Path, tmp_path: Path) -> None:
+    (own_model.parent / "tile.png").unlink()
+    with pytest.raises(SimulationError, match=r"tile\.png.*expected the file"):
+        sim.generate(str(own_model), tmp_path / "set")
+    own_model.write_text("<mujoco><worldbody><geom type='egg'/></worldbody></mujoco>")
+    with pytest.raises(SimulationError, match=r"yard\.xml.*egg.*expected an MJCF model"):
+        sim.generate(str(own_model), tmp_path / "set")
+    for scene, text in (
+        ("nowhere.xml", "no such file"),
+        ("nowhere:heap", "no module 'nowhere'"),
+        ("tests.sim.conftest:nothing", "no 'nothing'"),
+    ):
+        with pytest.raises(SimulationError, match=text):
+            sim.generate(scene, tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_function_is_a_scene(tmp_path: Path) -> None:
+    options = replace(OPTIONS, rig="gantry", sensor="sp1000", rgb=False)
+    path = sim.generate("tests.sim.conftest:heap", tmp_path / "set", options)
+    assert Dataset.open(path).header["name"] == "heap" and verify(path) == []
 
 
 def test_a_folder_with_other_things_is_refused(quick_scene: str, tmp_path: Path) -> None:
