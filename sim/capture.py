@@ -75,5 +75,6 @@ class Capture:
 
 def sensor_of(entry: Scene, options: GenerateOptions) -> DepthSensor:
     """The sensor in the size that the options ask for."""
-    sensor = find_sensor(options.sensor or entry.sensor)
+    sensor = options.sensor or entry.sensor
+    sensor = find_sensor(sensor) if isinstance(sensor, str) else sensor
     return sensor if options.size is None else sensor.resized(*options.size)

@@ -136,7 +136,9 @@ def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = No
             f"{dataset}: made with {_listed(source['versions'])}, here are {_listed(_versions())};"
             " expected the same"
         )
-    config = {k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()}
+    config: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()
+    }
     return generate(source["scene"], out, GenerateOptions(**config), progress)
 
 
