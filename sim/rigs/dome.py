@@ -62,7 +62,7 @@ class Dome:
         return Track(stamps, T_true, T, scaled(sigma_t, scale), scaled(sigma_r, scale))
 
     def _poses(self, model: mujoco.MjModel, rng: np.random.Generator, count: int) -> Array:
-        low, high = _extent(model)
+        low, high = extent(model)
         size, centre = np.maximum(high - low, 0.05)[:2], 0.5 * (low + high)[:2]
         # A view covers about 1.2 x 0.8 of its distance.
         distance = float(np.sqrt(self.overlap * size[0] * size[1] / (count * 0.96)))
@@ -78,23 +78,23 @@ class Dome:
         away = np.column_stack(
             [np.sin(lean) * np.cos(heading), np.sin(lean) * np.sin(heading), np.cos(lean)]
         )
-        return np.array([_look(aim[k] + distance * away[k], aim[k]) for k in range(count)])
+        return np.array([look(aim[k] + distance * away[k], aim[k]) for k in range(count)])
 
 
-def _look(eye: Array, at: Array) -> Array:
-    """T_world_camera (4, 4) of a camera at `eye` that looks at `at`, its x axis level."""
+def look(eye: Array, at: Array) -> Array:
+    """T_world_camera (4, 4) of a camera at `eye` that looks at `at` (3,), its x axis level."""
     z = (at - eye) / np.linalg.norm(at - eye)
-    x = np.cross(z, [0.0, 1.0, 0.0])
+    # Seen straight from above, the world's y is up in the image.
+    x = np.cross(z, [0.0, 0.0, 1.0]) if abs(z[2]) < 0.8 else np.cross([0.0, 1.0, 0.0], -z)
     x /= np.linalg.norm(x)
-    if x[0] < 0.0:
-        x = -x
     return np.asarray(se3.make(np.column_stack([x, np.cross(z, x), z]), eye))
 
 
-def _extent(model: mujoco.MjModel) -> tuple[Array, Array]:
+def extent(model: mujoco.MjModel, data: mujoco.MjData | None = None) -> tuple[Array, Array]:
     """The box (low, high) around all visible geoms but planes; the planes where nothing else is."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    if data is None:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
     triangles = triangles_of(model, data)
     plane = np.asarray(model.geom_type) == mujoco.mjtGeom.mjGEOM_PLANE
     kept = ~plane[triangles.geom]
