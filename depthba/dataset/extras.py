@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import json
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,22 +66,46 @@ def read_calibration(root: Path, faults: Faults) -> dict[str, Any] | None:
     if raw is None:
         return None
     with faults.within(CALIBRATION):
-        record = fields.mapping(raw, "it")
-        for key in ("T_flange_camera_true", "T_base_board_true"):
-            with faults.within(CALIBRATION):
-                if record.get(key) is not None:
-                    fields.rigid(record[key], key)
-        if record.get("board") is not None:
-            board = fields.mapping(record["board"], "board")
-            for key in ("columns", "rows"):
-                with faults.within(CALIBRATION):
-                    if key in board:
-                        fields.integer(board[key], f"board.{key}", least=1)
-            with faults.within(CALIBRATION):
-                if "square_m" in board:
-                    fields.number(board["square_m"], "board.square_m", above=0)
-        return record
+        return _calibration(raw, faults)
     return None
+
+
+def calibration_json(calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what calibration.json holds; transforms may be arrays (4, 4).
+
+    `MalformedError`: it could not be read.
+    """
+    raw = {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in calibration.items()
+    }
+    try:
+        raw = fields.parse(json.dumps(raw, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise MalformedError(f"no JSON: {error}") from error
+    faults = Faults(Path(), strict=False)
+    _calibration(raw, faults)
+    if faults.found:
+        raise MalformedError(faults.found[0].text)
+    return dict(raw)
+
+
+def _calibration(raw: Any, faults: Faults) -> dict[str, Any]:
+    record = fields.mapping(raw, "it")
+    for key in ("T_flange_camera_true", "T_base_board_true"):
+        with faults.within(CALIBRATION):
+            if record.get(key) is not None:
+                fields.rigid(record[key], key)
+    if record.get("board") is not None:
+        board = fields.mapping(record["board"], "board")
+        for key in ("columns", "rows"):
+            with faults.within(CALIBRATION):
+                if key in board:
+                    fields.integer(board[key], f"board.{key}", least=1)
+        with faults.within(CALIBRATION):
+            if "square_m" in board:
+                fields.number(board["square_m"], "board.square_m", above=0)
+    return record
 
 
 def _read_json(root: Path, file: str, faults: Faults) -> Any:  # JSON is untyped until it is checked

@@ -185,6 +185,18 @@ class DatasetWriter:
         with _disk(self.path):
             durable.write_json(self.path / extras.MARKERS, raw)
 
+    def write_calibration(self, calibration: Mapping[str, Any]) -> None:
+        """Write calibration.json, over one that is there; transforms may be arrays (4, 4).
+
+        Raises `DatasetError` for what could not be read back.
+        """
+        try:
+            raw = extras.calibration_json(calibration)
+        except MalformedError as error:
+            raise DatasetError(f"{self.path / extras.CALIBRATION}: {error}") from error
+        with _disk(self.path):
+            durable.write_json(self.path / extras.CALIBRATION, raw)
+
     def _encode(
         self, depth: ArrayLike | None, cloud: ArrayLike | None, rgb: ArrayLike | None
     ) -> dict[str, bytes]:
