@@ -1,0 +1,218 @@
+"""Which of the wanted camera poses the arm can take, one after the other, and with which joints."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import se3
+from depthba.kinematics import UR16E, DhArm
+from sim.engine import mujoco
+from sim.errors import SimulationError
+from sim.rigs.clearance import VIEW, Clearance
+from sim.robots.ur16e import T_FLANGE_CAMERA
+
+Array = NDArray[np.float64]
+
+_MANIPULABILITY = 0.06
+"""Least singular value of the Jacobian at a pose; typical is 0.2, at a singularity 0."""
+
+_ROOM = 0.1
+"""What stays between a joint and its limits, rad."""
+
+_STARTS = tuple(
+    (pan, lift, elbow, wrist_1, wrist_2, wrist_3)
+    for pan, lift, elbow, wrist_1, wrist_2 in (
+        (-3.5, -1.58, 1.42, -1.41, -1.57),
+        (0.36, -1.56, -1.42, -1.73, 1.57),
+        (-3.5, -1.01, 0.65, 1.94, 1.57),
+        (0.36, -2.13, -0.65, 1.20, -1.57),
+    )
+    for wrist_3 in (-2.1, 0.0, 2.1)
+)
+"""Where the search for joints begins: elbow up, tool down; pan is added to the goal's azimuth."""
+
+_REASONS = ("out of reach", "near a singularity", "in collision", "with the arm in view")
+_PATH, _OVERLAP = "with the way there blocked", "with too little overlap"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Poses of an arm in the order in which it takes them."""
+
+    q: Array
+    """(N, n) joints, rad."""
+    T_world_camera: Array
+    """(N, 4, 4) from these joints: the forward kinematics of the arm, not the wish."""
+    T_world_base: Array
+    """(4, 4)."""
+
+
+def plan(
+    model: mujoco.MjModel,
+    wanted: Iterable[Array],
+    count: int,
+    *,
+    arm: DhArm = UR16E,
+    T_flange_camera: Array = T_FLANGE_CAMERA,
+    overlap: float = 0.0,
+    margin: float = 0.02,
+    view: tuple[float, float] = VIEW,
+) -> Plan:
+    """Take the first `count` of the `wanted` camera poses that the arm in `model` can take in turn.
+
+    `wanted` gives, in order of preference, poses T_world_camera (4, 4) or stacks of alternatives
+    (m, 4, 4), of which at most one is taken. It may be endless only if enough of it can be had. A
+    pose is taken if some joints reach it inside their limits and away from singularities, nothing
+    comes closer to the arm than `margin` (m) there and on the straight joint path from the pose
+    before, no part of the arm is in the camera's `view` cone (rad), and it shares at least
+    `overlap` of its view of the plane z = 0 with the pose before, and that one with it.
+
+    Nothing here is random. SimulationError says how many candidates failed for which reason.
+    """
+    search = _Search(model, arm, T_flange_camera, overlap, margin, view)
+    for entry in wanted:
+        search.take_one(np.asarray(entry, float).reshape(-1, 4, 4))
+        if len(search.taken) == count:
+            q = np.array(search.taken)
+            return Plan(q, search.camera_at(q), search.T_world_base)
+    raise SimulationError(
+        f"the scene allows {len(search.taken)} of {count} poses: of {search.tried} candidates"
+        f" {search.reasons()}; expected more room around the arm, or fewer frames"
+    )
+
+
+class _Search:
+    """The poses taken so far, and why others were not."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        arm: DhArm,
+        T_flange_camera: Array,
+        overlap: float,
+        margin: float,
+        view: tuple[float, float],
+    ) -> None:
+        self._clearance = Clearance(model, arm.joints, margin, view)
+        self._arm, self._T_flange_camera, self._view = arm, T_flange_camera, view
+        self._T_camera_flange = se3.inverse(T_flange_camera)
+        self._overlap = overlap
+        self.T_world_base = self._clearance.T_world_base
+        self._T_base_world = se3.inverse(self.T_world_base)
+        self.taken: list[Array] = []
+        self.tried = 0
+        self._failed: Counter[str] = Counter()
+
+    def camera_at(self, q: Array) -> Array:
+        """T_world_camera (..., 4, 4)."""
+        return np.asarray(self.T_world_base @ self._arm.forward(q) @ self._T_flange_camera)
+
+    def reasons(self) -> str:
+        """How many candidates failed for which reason."""
+        known = (*_REASONS, _PATH, _OVERLAP)
+        return (
+            ", ".join(f"{self._failed[r]} {r}" for r in known if self._failed[r]) or "none failed"
+        )
+
+    def take_one(self, T_world_camera: Array) -> None:
+        """Take the first of some alternatives (m, 4, 4) that can be had, if any."""
+        T_base_flange = self._T_base_world @ T_world_camera @ self._T_camera_flange
+        q, right = self._solutions(T_base_flange)
+        for k in range(len(T_world_camera)):
+            self.tried += 1
+            if self.taken and self._overlap > 0.0:
+                T_before = self.camera_at(self.taken[-1])
+                if shared_view(T_before, T_world_camera[k], self._view) < self._overlap:
+                    self._failed[_OVERLAP] += 1
+                    continue
+            reason = self._take(q[k][right[k]], T_world_camera[k])
+            if reason is None:
+                return
+            self._failed[reason] += 1
+
+    def _solutions(self, T_base_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Joints (m, k, n) from k starts for each pose (m, 4, 4), and which are right."""
+        azimuth = np.arctan2(T_base_flange[:, 1, 3], T_base_flange[:, 0, 3])
+        starts = np.repeat(np.array(_STARTS)[None], len(T_base_flange), axis=0)
+        starts[..., 0] += azimuth[:, None]
+        starts[..., 0] = (starts[..., 0] + np.pi) % (2.0 * np.pi) - np.pi
+        if self.taken:
+            last = np.broadcast_to(self.taken[-1], (len(starts), 1, starts.shape[-1]))
+            starts = np.concatenate([last, starts], axis=1)
+        return self._arm.solve(T_base_flange[:, None], starts, tolerance=1e-10, steps=25)
+
+    def _take(self, q: Array, T_world_camera: Array) -> str | None:
+        """Take one of the solutions (k, n), the nearest if any; else the furthest they came."""
+        before = self.taken[-1] if self.taken else None
+        if before is not None:
+            q = self._arm.unwound(_turned_towards(q, before))
+        low, high = np.add(self._arm.lower, _ROOM), np.subtract(self._arm.upper, _ROOM)
+        q = q[((q >= low) & (q <= high)).all(axis=-1)]
+        if len(q) == 0:
+            return _REASONS[0]
+        q = q[self._arm.manipulability(q) >= _MANIPULABILITY]
+        if len(q) == 0:
+            return _REASONS[1]
+        stage = 2
+        for one in _by_distance(q, before):
+            if not self._clearance.out_of_sight(one, T_world_camera):
+                stage = max(stage, 3)
+                continue
+            if not self._clearance.free(one):
+                continue
+            if before is not None and not self._clearance.path_free(before, one):
+                stage = 4
+                continue
+            self.taken.append(one)
+            return None
+        return (*_REASONS, _PATH)[stage]
+
+
+def _turned_towards(q: Array, before: Array) -> Array:
+    """Joints (k, n) by full turns as near to `before` (n,) as they come."""
+    turn = 2.0 * np.pi
+    return np.asarray(q - turn * np.round((q - before) / turn))
+
+
+def _by_distance(q: Array, before: Array | None) -> Iterator[Array]:
+    """Solutions (k, n), each once, the one with the shortest way first."""
+    distance = np.abs(q - (0.0 if before is None else before)).max(axis=-1)
+    given: list[Array] = []
+    for k in np.argsort(np.round(distance, 6), kind="stable"):
+        if not any(np.abs(q[k] - other).max() < 1e-6 for other in given):
+            given.append(q[k])
+            yield q[k]
+
+
+def shared_view(
+    T_world_a: Array, T_world_b: Array, view: tuple[float, float] = VIEW, reach: float = 3.0
+) -> float:
+    """The share of the plane z = 0 seen by one camera that the other sees too; the lesser way.
+
+    Of rays spread evenly over the view; what lies beyond `reach` (m) counts as not shared.
+    """
+    return min(
+        _seen_again(T_world_a, T_world_b, view, reach),
+        _seen_again(T_world_b, T_world_a, view, reach),
+    )
+
+
+def _seen_again(
+    T_world_a: Array, T_world_b: Array, view: tuple[float, float], reach: float
+) -> float:
+    half = np.tan(np.multiply(view, 0.5))
+    x, y = np.meshgrid(np.linspace(-0.95, 0.95, 15) * half[0], np.linspace(-0.9, 0.9, 10) * half[1])
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ T_world_a[:3, :3].T
+    with np.errstate(divide="ignore"):
+        depth = -T_world_a[2, 3] / rays[:, 2]
+    hit = (depth > 0.0) & (depth < reach)
+    p_world = T_world_a[:3, 3] + rays[hit] * depth[hit, None]
+    p_b = (p_world - T_world_b[:3, 3]) @ T_world_b[:3, :3]
+    z = np.maximum(p_b[:, 2], 1e-9)
+    seen = (p_b[:, 2] > 0.0) & (np.abs(p_b[:, :2] / z[:, None]) <= half).all(axis=-1)
+    return float(seen.sum() / len(rays))
