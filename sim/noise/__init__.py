@@ -1,77 +1,49 @@
-"""What a sensor does to exact depth: a row of named stages, each with its own seed and switch."""
+"""What a sensor does to exact depth: a row of named stages, each with its own seed and switch.
+
+The order is that of the causes: what both eyes see, where outlines fall, the disparity and its
+errors, what is given up as unreliable, what is stored.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.camera import RangeNoise
 from sim.errors import SimulationError
+from sim.noise.disparity import (
+    DisparityNoise,
+    DisparitySteps,
+    FixedPattern,
+    Grazing,
+    random_sigma,
+    step_sigma,
+)
+from sim.noise.dropout import Dropout
+from sim.noise.outlines import FlyingPixels, LateralJitter, Shadow
 from sim.noise.shot import Shot
+from sim.noise.stage import Stage
+from sim.noise.storage import Quantisation, RangeLimits
 from sim.seeds import stream
+from sim.sensors import DepthSensor
 
 Array = NDArray[np.float64]
 
-
-class Stage(Protocol):
-    """One fault of a sensor."""
-
-    @property
-    def name(self) -> str:
-        """What the command line and the random stream call it."""
-
-    @property
-    def is_noise(self) -> bool:
-        """True where `--clean` leaves it out; False for what the file format does anyway."""
-
-    def __call__(self, depth: Array, shot: Shot, rng: np.random.Generator) -> Array:
-        """The depth (height, width) m after this stage; NaN where there is no measurement."""
-
-
-@dataclass(frozen=True)
-class RangeJitter:
-    """Independent Gaussian noise of every pixel, along the ray or along z, as the sensor says."""
-
-    name: str = "range-noise"
-    is_noise: bool = True
-
-    def __call__(self, depth: Array, shot: Shot, rng: np.random.Generator) -> Array:
-        """Shift every depth by a draw of the sensor's sigma at that depth."""
-        # Drawn for holes too, so that one more hole leaves the other pixels' noise as it was.
-        error = shot.sensor.noise.sigma(depth) * rng.standard_normal(depth.shape)
-        if shot.sensor.noise.along == "range":
-            error /= np.linalg.norm(shot.rays, axis=-1)
-        return np.asarray(depth + error)
-
-
-@dataclass(frozen=True)
-class RangeLimits:
-    """No measurement outside the sensor's range."""
-
-    name: str = "range-limits"
-    is_noise: bool = False
-
-    def __call__(self, depth: Array, shot: Shot, rng: np.random.Generator) -> Array:
-        """Drop depths outside depth_min to depth_max."""
-        inside = (depth >= shot.sensor.depth_min) & (depth <= shot.sensor.depth_max)
-        return np.where(inside, depth, np.nan)
-
-
-@dataclass(frozen=True)
-class Quantisation:
-    """Whole counts of the sensor's depth scale."""
-
-    name: str = "quantisation"
-    is_noise: bool = False
-
-    def __call__(self, depth: Array, shot: Shot, rng: np.random.Generator) -> Array:
-        """Round to the nearest count."""
-        return np.asarray(np.rint(depth / shot.sensor.depth_scale) * shot.sensor.depth_scale)
-
-
-STAGES: tuple[Stage, ...] = (RangeJitter(), RangeLimits(), Quantisation())
+STAGES: tuple[Stage, ...] = (
+    Shadow(),
+    LateralJitter(),
+    FlyingPixels(),
+    FixedPattern(),
+    DisparityNoise(),
+    Grazing(),
+    DisparitySteps(),
+    Dropout(),
+    RangeLimits(),
+    Quantisation(),
+)
 
 
 def choose_stages(clean: bool = False, without: tuple[str, ...] = ()) -> tuple[Stage, ...]:
@@ -90,6 +62,41 @@ def measure(
     depth: Array, shot: Shot, seed: int, frame: int, stages: tuple[Stage, ...] = STAGES
 ) -> Array:
     """What the sensor reports of the exact depth (height, width) m of a frame; NaN: nothing."""
+    measured = depth
+    for _, after in _steps(depth, shot, seed, frame, stages):
+        measured = after
+    return measured
+
+
+def staged(
+    depth: Array, shot: Shot, seed: int, frame: int, stages: tuple[Stage, ...] = STAGES
+) -> list[tuple[str, Array]]:
+    """Like `measure`, but each stage's name with the depth after it, in order."""
+    return list(_steps(depth, shot, seed, frame, stages))
+
+
+def _steps(
+    depth: Array, shot: Shot, seed: int, frame: int, stages: tuple[Stage, ...]
+) -> Iterator[tuple[str, Array]]:
     for stage in stages:
-        depth = stage(depth, shot, stream(seed, "noise", stage.name, frame))
-    return depth
+        labels = (stage.name, frame) if stage.per_frame else (stage.name,)
+        depth = stage(depth, shot, stream(seed, "noise", *labels))
+        yield stage.name, depth
+
+
+def stated_noise(sensor: DepthSensor, stages: tuple[Stage, ...] = STAGES) -> RangeNoise | None:
+    """What a dataset may say of its noise: the sensor's, less what absent stages would add.
+
+    None where nothing random is left of it.
+    """
+    parts = {
+        "disparity-noise": random_sigma(sensor) ** 2,
+        "disparity-steps": step_sigma(sensor) ** 2,
+        "fixed-pattern": sensor.pattern**2,
+    }
+    names = [stage.name for stage in stages]
+    if "disparity-noise" not in names:
+        return None
+    absent = sum(part for name, part in parts.items() if name not in names)
+    share = 1.0 - absent / sensor.disparity_sigma**2
+    return replace(sensor.noise, sigma_m=sensor.noise.sigma_m * float(np.sqrt(share)))

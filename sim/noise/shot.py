@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from sim.sensors import DepthSensor
 from sim.shading import Finish
 
 Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,28 @@ class Shot:
     hits: Hits
     """What the pixels' rays met: of shape (height, width)."""
 
+    def rays(self, v: Indices, u: Indices) -> Array:
+        """Viewing rays (n, 3) of the pixels in rows v and columns u, with z = 1, camera frame."""
+        camera = self.sensor.camera
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        return np.column_stack([x, y, np.ones(len(x))])
+
     @property
-    def rays(self) -> Array:
-        """(height, width, 3) viewing rays with z = 1, camera frame."""
-        return self.sensor.camera.rays()
+    def eye(self) -> Array:
+        """(3,) the second eye, or the projector, world frame."""
+        T = self.T_world_camera
+        return np.asarray(T[:3, 3] + self.sensor.baseline * T[:3, 0])
+
+    @cached_property
+    def cosine(self) -> Image:
+        """(height, width) of the angle between viewing ray and surface normal; 1 at a miss."""
+        camera = self.sensor.camera
+        x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+        y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
+        # Turned into the camera's axes by triangle, of which there are fewer than pixels.
+        turned = np.einsum("ij,jk->ik", self.scene.normals, self.T_world_camera[:3, :3])
+        n = turned.astype(np.float32)[self.hits.triangle]
+        towards = n[..., 0] * x + n[..., 1] * y + n[..., 2]
+        cosine = np.abs(towards) / np.sqrt(x * x + y * y + np.float32(1.0))
+        cosine[self.hits.triangle < 0] = 1.0
+        return np.asarray(np.minimum(cosine, np.float32(1.0)))
