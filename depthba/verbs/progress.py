@@ -1,39 +1,42 @@
-"""Shows how a registration goes: a bar on a terminal, plain lines elsewhere; always on stderr."""
+"""Shows how work goes: a bar on a terminal, plain lines elsewhere; always on stderr."""
 
 from __future__ import annotations
 
 from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 
-from depthba.result import Iteration
 from depthba.verbs.output import angle, length
 
+if TYPE_CHECKING:
+    from depthba.result import Iteration
 
-class RegistrationProgress:
-    """A callback for `depthba.register` that shows level, iteration, cost and step.
+
+class Bar:
+    """A bar with a name in front and a few words behind; a line for each call without a terminal.
 
     Use it as a context manager, so that the terminal is whole again whatever happens.
     """
 
-    def __init__(self, name: str = "registering") -> None:
-        """``name`` stands in front of the bar and of every line."""
+    def __init__(self, name: str, state: str = "", *columns: ProgressColumn) -> None:
+        """``name`` stands in front of the bar and of every line, ``columns`` behind the words."""
         self._name = name
         self._console = Console(stderr=True, soft_wrap=True, highlight=False)
         self._bar: Progress | None = None
         if self._console.is_terminal:
             self._bar = Progress(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=24),
-                TextColumn("{task.fields[state]}"),
-                TimeElapsedColumn(),
+                TextColumn("{task.fields[state]}", markup=False),
+                *columns,
                 console=self._console,
                 transient=True,
             )
-            self._task = self._bar.add_task(name, total=None, state="reading frames")
+            self._task = self._bar.add_task(name, total=None, state=state)
 
-    def __enter__(self) -> RegistrationProgress:
+    def __enter__(self) -> Self:
         """Start showing."""
         if self._bar is not None:
             self._bar.start()
@@ -49,6 +52,26 @@ class RegistrationProgress:
         if self._bar is not None:
             self._bar.stop()
 
+    @property
+    def drawn(self) -> bool:
+        """Whether there is a terminal: lines may then come as often as they like."""
+        return self._bar is not None
+
+    def show(self, state: str, done: float, total: float | None) -> None:
+        """Show what is being done, and how much of everything is; None: nobody knows."""
+        if self._bar is None:
+            self._console.print(f"{self._name}: {state}", markup=False)
+        else:
+            self._bar.update(self._task, total=total, completed=done, state=state)
+
+
+class RegistrationProgress(Bar):
+    """A callback for `depthba.register` that shows level, iteration, cost and step."""
+
+    def __init__(self, name: str = "registering") -> None:
+        """``name`` stands in front of the bar and of every line."""
+        super().__init__(name, "reading frames", TimeElapsedColumn())
+
     def __call__(self, iteration: Iteration) -> None:
         """Show one iteration."""
         # how many iterations a level takes is not known: the robust phase counts as its second half
@@ -57,10 +80,7 @@ class RegistrationProgress:
 
     def say(self, state: str, share: float = 1.0) -> None:
         """Show what is being done, and which share of everything is."""
-        if self._bar is None:
-            self._console.print(f"{self._name}: {state}", markup=False)
-        else:
-            self._bar.update(self._task, total=1.0, completed=share, state=state)
+        self.show(state, share, 1.0)
 
 
 def _state(iteration: Iteration) -> str:
