@@ -24,17 +24,16 @@ _MANIPULABILITY = 0.06
 _ROOM = 0.1
 """What stays between a joint and its limits, rad."""
 
-_STARTS = tuple(
-    (pan, lift, elbow, wrist_1, wrist_2, wrist_3)
-    for pan, lift, elbow, wrist_1, wrist_2 in (
-        (-3.5, -1.58, 1.42, -1.41, -1.57),
-        (0.36, -1.56, -1.42, -1.73, 1.57),
-        (-3.5, -1.01, 0.65, 1.94, 1.57),
-        (0.36, -2.13, -0.65, 1.20, -1.57),
-    )
-    for wrist_3 in (-2.1, 0.0, 2.1)
+_STARTS = (
+    (-3.5, -1.58, 1.42, -1.41, -1.57, 0.0),
+    (0.36, -1.56, -1.42, -1.73, 1.57, 0.0),
+    (-3.5, -1.01, 0.65, 1.94, 1.57, 0.0),
+    (0.36, -2.13, -0.65, 1.20, -1.57, 0.0),
 )
 """Where the search for joints begins: elbow up, tool down; pan is added to the goal's azimuth."""
+
+_BATCH = 8
+"""Alternatives whose joints are searched for together."""
 
 _REASONS = ("out of reach", "near a singularity", "in collision", "with the arm in view")
 _PATH, _OVERLAP = "with the way there blocked", "with too little overlap"
@@ -121,26 +120,38 @@ class _Search:
 
     def take_one(self, T_world_camera: Array) -> None:
         """Take the first of some alternatives (m, 4, 4) that can be had, if any."""
+        left = np.arange(len(T_world_camera))
+        if self.taken and self._overlap > 0.0:
+            T_before = self.camera_at(self.taken[-1])
+            near = shared_view(T_before, T_world_camera, self._view) >= self._overlap
+            self.tried += int(np.sum(~near))
+            self._failed[_OVERLAP] += int(np.sum(~near))
+            left = left[near]
+        for k in range(0, len(left), _BATCH):
+            if self._take_first(T_world_camera[left[k : k + _BATCH]]):
+                return
+
+    def _take_first(self, T_world_camera: Array) -> bool:
+        """Take the first of a batch (m, 4, 4) that can be had; False: none."""
         T_base_flange = self._T_base_world @ T_world_camera @ self._T_camera_flange
         q, right = self._solutions(T_base_flange)
         for k in range(len(T_world_camera)):
             self.tried += 1
-            if self.taken and self._overlap > 0.0:
-                T_before = self.camera_at(self.taken[-1])
-                if shared_view(T_before, T_world_camera[k], self._view) < self._overlap:
-                    self._failed[_OVERLAP] += 1
-                    continue
             reason = self._take(q[k][right[k]], T_world_camera[k])
             if reason is None:
-                return
+                return True
             self._failed[reason] += 1
+        return False
 
     def _solutions(self, T_base_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Joints (m, k, n) from k starts for each pose (m, 4, 4), and which are right."""
-        azimuth = np.arctan2(T_base_flange[:, 1, 3], T_base_flange[:, 0, 3])
         starts = np.repeat(np.array(_STARTS)[None], len(T_base_flange), axis=0)
-        starts[..., 0] += azimuth[:, None]
+        starts[..., 0] += np.arctan2(T_base_flange[:, 1, 3], T_base_flange[:, 0, 3])[:, None]
         starts[..., 0] = (starts[..., 0] + np.pi) % (2.0 * np.pi) - np.pi
+        # The last joint turns about the goal's z: what is left of the rotation about it.
+        R_start = self._arm.forward(starts)[..., :3, :3]
+        R = np.swapaxes(R_start, -1, -2) @ T_base_flange[:, None, :3, :3]
+        starts[..., -1] = np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])
         if self.taken:
             last = np.broadcast_to(self.taken[-1], (len(starts), 1, starts.shape[-1]))
             starts = np.concatenate([last, starts], axis=1)
@@ -189,30 +200,26 @@ def _by_distance(q: Array, before: Array | None) -> Iterator[Array]:
             yield q[k]
 
 
-def shared_view(
-    T_world_a: Array, T_world_b: Array, view: tuple[float, float] = VIEW, reach: float = 3.0
-) -> float:
-    """The share of the plane z = 0 seen by one camera that the other sees too; the lesser way.
+def shared_view(T_world_a: Array, T_world_b: Array, view: tuple[float, float] = VIEW) -> Array:
+    """The share (...) of what one camera sees of the plane z = 0 that the other sees too.
 
-    Of rays spread evenly over the view; what lies beyond `reach` (m) counts as not shared.
+    Poses (..., 4, 4); the lesser way. Of rays spread evenly over the view that meet the plane
+    within 2 m.
     """
-    return min(
-        _seen_again(T_world_a, T_world_b, view, reach),
-        _seen_again(T_world_b, T_world_a, view, reach),
-    )
+    ways = _seen_again(T_world_a, T_world_b, view), _seen_again(T_world_b, T_world_a, view)
+    return np.minimum(*ways)
 
 
-def _seen_again(
-    T_world_a: Array, T_world_b: Array, view: tuple[float, float], reach: float
-) -> float:
+def _seen_again(T_world_a: Array, T_world_b: Array, view: tuple[float, float]) -> Array:
     half = np.tan(np.multiply(view, 0.5))
     x, y = np.meshgrid(np.linspace(-0.95, 0.95, 15) * half[0], np.linspace(-0.9, 0.9, 10) * half[1])
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ T_world_a[:3, :3].T
+    p_camera = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays = p_camera @ np.swapaxes(T_world_a[..., :3, :3], -1, -2)
     with np.errstate(divide="ignore"):
-        depth = -T_world_a[2, 3] / rays[:, 2]
-    hit = (depth > 0.0) & (depth < reach)
-    p_world = T_world_a[:3, 3] + rays[hit] * depth[hit, None]
-    p_b = (p_world - T_world_b[:3, 3]) @ T_world_b[:3, :3]
-    z = np.maximum(p_b[:, 2], 1e-9)
-    seen = (p_b[:, 2] > 0.0) & (np.abs(p_b[:, :2] / z[:, None]) <= half).all(axis=-1)
-    return float(seen.sum() / len(rays))
+        depth = -T_world_a[..., 2, 3, None] / rays[..., 2]
+    hit = (depth > 0.0) & (depth < 2.0)
+    p_world = T_world_a[..., None, :3, 3] + rays * np.where(hit, depth, 0.0)[..., None]
+    p_b = (p_world - T_world_b[..., None, :3, 3]) @ T_world_b[..., :3, :3]
+    bound = half * np.maximum(p_b[..., 2:], 0.0)
+    seen = hit & (p_b[..., 2] > 0.0) & (np.abs(p_b[..., :2]) <= bound).all(axis=-1)
+    return np.asarray(seen.sum(axis=-1) / np.maximum(hit.sum(axis=-1), 1))
