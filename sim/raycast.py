@@ -103,7 +103,7 @@ class RayScene:
         """One ray through each pixel's centre: `distance` (height, width) is the exact depth, m."""
         return self.cast(T_world_camera[:3, 3], world_rays(camera, T_world_camera))
 
-    def blocked(self, points: Array, direction: Array) -> NDArray[np.bool_]:
+    def blocked(self, points: NDArray[np.floating], direction: Array) -> NDArray[np.bool_]:
         """Whether anything stands in the way from points (n, 3) along one direction (3,)."""
         o = np.ascontiguousarray(points, np.float32)
         d = np.ascontiguousarray(np.broadcast_to(direction, points.shape), np.float32)

@@ -8,13 +8,14 @@ sphere.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import mujoco
 from sim.errors import SimulationError
+from sim.textures import coordinates
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -36,6 +37,10 @@ class Triangles:
     """(m, 3), counter-clockwise seen from outside."""
     geom: Indices
     """(m,) geom id of each face."""
+    textured: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(k,) the faces that have a texture."""
+    texcoord: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    """(k, 3, 3) their corners' texture coordinates: u, v, 0; a direction into a cube texture."""
 
 
 def triangles_of(
@@ -50,7 +55,8 @@ def triangles_of(
     """
     local: dict[tuple[object, ...], Mesh] = {}
     vertices, faces, owner = [], [], []
-    count = 0
+    textured, texcoord = [np.zeros(0, np.int64)], [np.zeros((0, 3, 3))]
+    count = before = 0
     for geom in range(model.ngeom):
         if model.geom_group[geom] not in groups or _alpha(model, geom) == 0.0:
             continue
@@ -61,10 +67,21 @@ def triangles_of(
         vertices.append(v @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
         faces.append(f + count)
         owner.append(np.full(len(f), geom))
+        laid = coordinates(model, geom, v, f)
+        if laid is not None:
+            textured.append(np.arange(before, before + len(f)))
+            texcoord.append(laid)
         count += len(v)
+        before += len(f)
     if not vertices:
         raise SimulationError("the scene has no visible geom")
-    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(owner))
+    return Triangles(
+        np.concatenate(vertices),
+        np.concatenate(faces),
+        np.concatenate(owner),
+        np.concatenate(textured),
+        np.concatenate(texcoord),
+    )
 
 
 def _alpha(model: mujoco.MjModel, geom: int) -> float:
