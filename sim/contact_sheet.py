@@ -85,7 +85,7 @@ def _sheet(panels: int, height: int, width: int) -> tuple[Figure, list[Axes]]:
     size = step * [_COLUMNS, rows] + [20, _HEAD]
     figure = Figure(figsize=tuple(size / _DPI), dpi=_DPI)
     FigureCanvasAgg(figure)
-    axes = []
+    axes: list[Axes] = []
     for row, column in np.ndindex(rows, _COLUMNS):
         left = 20 + column * step[0]
         bottom = size[1] - _HEAD - row * step[1] - _ABOVE - height
@@ -110,13 +110,18 @@ def statistics(before: Array, after: Array) -> str:
     touched = 100.0 * len(change) / before.size
     typical = 1e3 * float(np.median(np.abs(change)))
     return (
-        f"σ {1e3 * float(np.std(change)):.3g} mm, median size {typical:.2g} mm"
-        f" on {touched:.2g} %; {holes}"
+        f"σ {_short(1e3 * float(np.std(change)))} mm, median size {_short(typical)} mm"
+        f" on {_short(touched)} %; {holes}"
     )
 
 
 def _share(holes: float) -> str:
-    return f"holes {100.0 * holes:.2g} %" if holes else "no holes"
+    return f"holes {_short(100.0 * holes)} %" if holes else "no holes"
+
+
+def _short(x: float) -> str:
+    """Two digits, but never an exponent."""
+    return f"{x:.0f}" if x >= 99.5 else f"{x:.2g}"
 
 
 def _dots(k: int) -> str:
@@ -155,8 +160,9 @@ def _change_panel(axis: Axes, before: Array, after: Array, k: int) -> None:
         vmax=scale,
         interpolation="nearest",
     )
-    _hole_dots(axis, _blocks(np.isnan(before), k).all(axis=-1), _EARLIER)
-    _hole_dots(axis, _blocks(np.isnan(after) & np.isfinite(before), k).any(axis=-1), _HOLE)
+    _hole_dots(axis, np.all(_blocks(np.isnan(before), k), axis=-1), _EARLIER)
+    lost = np.isnan(after) & np.isfinite(before)
+    _hole_dots(axis, np.any(_blocks(lost, k), axis=-1), _HOLE)
     if len(touched):
         _bar(axis, image, "mm")
 

@@ -21,8 +21,8 @@ def taps(width: float) -> Image:
 def windowed(rng: np.random.Generator, shape: tuple[int, ...], width: float) -> Image:
     """Gaussian noise of unit variance, (height, width): white noise seen through a window.
 
-    The correlation falls linearly with the distance along each axis and is gone at the window's
-    width. A window of a pixel or less leaves it white.
+    Draws so many pixels apart are correlated by the share of the window that they have in common,
+    along each axis. A window of a pixel or less leaves the noise white.
     """
     box = taps(width)
     r = len(box) // 2
