@@ -120,21 +120,22 @@ _BAR = (0.175, 0.030, 0.033)
 """Width, height and depth of the ZED 2's bar, m (data sheet); its eyes lie 120 mm apart."""
 
 _HULLS = (
-    _Shape(BASE, (0, 0, 0.0), (0, 0, 0.03), 0.096),
-    _Shape(_SHOULDER_LINK, (0, 0, 0.15), (0, 0, _D1), 0.080),
+    _Shape(BASE, (0, 0, 0.0), (0, 0, 0.06), 0.097),
+    _Shape(_SHOULDER_LINK, (0, 0, 0.125), (0, 0, _D1), 0.085),
     _Shape(_SHOULDER_LINK, (0, 0.045, _D1), (0, -0.055, _D1), 0.090),
     _Shape(_UPPER_ARM, (0, 0, 0.155), (0, 0, 0.200), 0.095),
     _Shape(_UPPER_ARM, (0, 0, _UPPER), (_A2, 0, _UPPER), 0.066),
     _Shape(_UPPER_ARM, (_A2, 0, 0.150), (_A2, 0, 0.200), 0.076),
     _Shape(_FOREARM, (0, 0, 0.060), (0, 0, 0.015), 0.077),
     _Shape(_FOREARM, (0, 0, _FORE), (_A3, 0, _FORE), 0.054),
-    _Shape(_FOREARM, (_A3, 0, 0.022), (_A3, 0, 0.055), 0.059),
+    _Shape(_FOREARM, (_A3, 0, 0.022), (_A3, 0, 0.055), 0.060),
     _Shape(_WRIST_1, (0, 0, 0.130), (0, 0, 0.190), 0.060),
     _Shape(_WRIST_1, (0, 0, _D4), (0, -0.020, _D4), 0.063),
     _Shape(_WRIST_2, (0, 0, 0.105), (0, 0, 0.135), 0.060),
-    _Shape(_WRIST_2, (0, 0, _D5), (0, 0.025, _D5), 0.062),
+    _Shape(_WRIST_2, (0, 0, _D5), (0, 0.025, _D5), 0.064),
     _Shape(_WRIST_3, (0, 0, 0.080), (0, 0, 0.088), 0.048),
-    _Shape(CAMERA, (-0.0125, 0, -0.0185), (0.1325, 0, -0.0185), 0.024),
+    _Shape(_WRIST_3, (0, 0, _D6 + 0.004), (0.029, -0.0503, _D6 + 0.004), 0.047),
+    _Shape(CAMERA, (-0.0125, 0, -0.0185), (0.1325, 0, -0.0185), 0.028),
 )
 """Capsules around the shapes, for collisions: every shape's rim lies inside one."""
 
