@@ -1,7 +1,7 @@
 """Datasets in great number: one scene, seeds in turn, on all cores or on a cluster.
 
 One dataset is one piece of work. Its bytes hang on its seed alone, so it does not matter who makes
-it, when, or how often it was begun.
+it, when, or how often it was begun. (Machines of another kind may round otherwise.)
 """
 
 from __future__ import annotations

@@ -68,18 +68,19 @@ def show(there: dict[str, list[dict[str, Any]]]) -> None:
     # A pipe has no width of its own, and a table must not be cut there.
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     heads = ["scene", "rig", "sensor", ">frames", "what stands there"]
-    rows = [[str(value) for value in scene.values()] for scene in there["scenes"]]
-    console.print(_table(heads, rows))
-    console.print(
-        _table(["rig", ">frames", ""], [list(map(str, r.values())) for r in there["rigs"]])
-    )
+    console.print(_table(heads, [_words(scene) for scene in there["scenes"]]))
+    console.print(_table(["rig", ">frames", "what it does"], [_words(r) for r in there["rigs"]]))
     heads = ["sensor", ">pixels", ">focal length", ">baseline", ">range", ">range noise"]
     console.print(_table(heads, [_sensor(sensor) for sensor in there["sensors"]]))
     rows = [
-        [stage["name"], "" if stage["noise"] else "stays", stage["description"]]
+        [stage["name"], "left out" if stage["noise"] else "stays", stage["description"]]
         for stage in there["noise_stages"]
     ]
     console.print(_table(["stage of the noise", "--clean", "what it does"], rows))
+
+
+def _words(row: dict[str, Any]) -> list[str]:
+    return ["" if value is None else str(value) for value in row.values()]
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
@@ -110,7 +111,8 @@ def _sensor(sensor: dict[str, Any]) -> list[str]:
 
 
 def _frames(rig: Rig) -> int | None:
-    frames = getattr(rig, "frames", None)
+    """How many frames the rig takes unless told otherwise; None: it does not say."""
+    frames: int | None = getattr(rig, "frames", None) or getattr(rig, "count", None)
     if frames is None and hasattr(rig, "stations"):
         frames = len(rig.stations())
     return frames

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import sim
-from depthba.cli import main
 from depthba.dataset import Dataset, verify
 from depthba.errors import DatasetError, DepthbaError, OptionError
 from sim.engine import mujoco
@@ -192,29 +191,6 @@ def test_errors_name_the_offender_and_the_choices(tmp_path: Path) -> None:
         with pytest.raises(OptionError, match=next(iter(wrong))):
             sim.GenerateOptions(**wrong)
     assert not (tmp_path / "set").exists()
-
-
-def test_the_verb_prints_one_object(
-    quick_scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "set"
-    words = ["generate", quick_scene, "--out", str(out), "--size", "80x60", "--frames", "3"]
-    assert main([*words, "--start-error", "0.01", "0.02", "--clean", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["path"] == str(out) and said["frames"] == 3 and said["seconds"] > 0
-    assert Dataset.open(out).header["source"]["config"]["start_error"] == [0.01, 0.02]
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [(["moon"], "industrial-6"), (["industrial-6", "--size", "big"], "320x240")],
-)
-def test_the_verb_answers_known_errors_in_one_line(
-    words: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["generate", *words, "--out", str(tmp_path / "set")]) == 1
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("depthba: error:") and text in error
 
 
 def test_the_public_names_import_nothing_heavy() -> None:
