@@ -37,6 +37,7 @@ class Rig(Protocol):
 
 
 RIGS: dict[str, str] = {
+    "arm": "sim.rigs.arm:Arm",
     "dome": "sim.rigs.dome:Dome",
     "gantry": "sim.rigs.gantry:Gantry",
 }
