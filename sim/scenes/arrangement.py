@@ -13,11 +13,17 @@ from scipy.spatial import ConvexHull
 from sim.engine import mujoco
 from sim.raycast import RayScene
 from sim.scenes.relief import frame
-from sim.scenes.solids import Solid, about, joined
+from sim.scenes.solids import Solid, joined
 from sim.tessellate import Triangles
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
+
+
+def pick(rng: np.random.Generator, choices: tuple[Colour, ...]) -> Colour:
+    """One of several colours."""
+    return choices[int(rng.integers(len(choices)))]
+
 
 MATERIALS = {
     "matt": (0.0, 0.0),
@@ -77,10 +83,10 @@ class Piece:
         centre = _centroid(whole)
         hull = ConvexHull(whole.vertices)
         normals = hull.equations[:, :3]
-        heights = -(hull.equations[:, 3] + normals @ centre)
+        heights = -(hull.equations[:, 3] + np.einsum("ij,j->i", normals, centre))
         down = np.array([0.0, 0.0, -1.0])
         for _ in range(1000):
-            towards = normals @ down
+            towards = np.einsum("ij,j->i", normals, down)
             under = np.where(towards > 1e-9, heights / np.maximum(towards, 1e-9), np.inf)
             facet = int(np.argmin(under))
             if heights[facet] >= under[facet] * (1.0 - 1e-12):
@@ -88,7 +94,7 @@ class Piece:
             down = normals[facet]
         ahead = np.eye(3)[int(np.argmin(np.abs(down)))]
         turn = frame(-down, ahead).T
-        lowest = float((whole.vertices @ turn[2]).min())
+        lowest = float(np.einsum("ij,j->i", whole.vertices, turn[2]).min())
         return self.moved((0.0, 0.0, -lowest), turn)
 
 
@@ -186,40 +192,39 @@ class Plot:
 
     def put(self, piece: Piece, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Pose:
         """Stand a piece at a place of this plot, unchecked; returns its pose in the world."""
-        where = Pose(x, y, z, yaw)
-        shape = _footprint(piece)
-        turn = about(2, yaw)[:2, :2]
-        ways = np.einsum("ij,ni->nj", turn, _FEW)
-        supports = np.stack([(ways @ hull.T).max(axis=1) for hull in shape])
-        self._taken = np.concatenate([self._taken, supports + _FEW @ [x, y]])
+        ways = np.einsum("ij,ni->nj", about(2, yaw)[:2, :2], _FEW)
+        reach = [
+            np.einsum("di,ni->dn", ways, hull).max(axis=1) + np.einsum("di,i->d", _FEW, [x, y])
+            for hull in _footprint(piece)
+        ]
+        return self._stand(piece, np.stack(reach), Pose(x, y, z, yaw))
+
+    def _stand(self, piece: Piece, support: Array, where: Pose) -> Pose:
+        self._taken = np.concatenate([self._taken, support])
         pose = self.at.at(where)
         self.bench.add(piece, pose)
         return pose
 
-    def scatter(
-        self, rng: np.random.Generator, piece: Piece, tries: int = 300, yaw: float | None = None
-    ) -> Pose | None:
-        """Stand a piece at a random free place; None if it found none, or is too tall.
+    def scatter(self, rng: np.random.Generator, piece: Piece, tries: int = 300) -> Pose | None:
+        """Stand a piece at a random free place, with any heading; returns its pose in the world.
 
-        `yaw` fixes its heading in the plot's frame to within a few degrees.
+        None if it found no place, or is too tall.
         """
         if max(float(part.solid.vertices[:, 2].max()) for part in piece.parts) > self.height:
             return None
-        fine = np.stack([(_DIRECTIONS @ hull.T).max(axis=1) for hull in _footprint(piece)])
+        fine = np.stack([_support(hull) for hull in _footprint(piece)])
         every = _COARSE * np.arange(len(_FEW))
         for _ in range(-(-tries // 50)):
             at = rng.uniform(-1.0, 1.0, (50, 2)) * self.half
-            if yaw is None:
-                shift = rng.integers(0, _FINE, 50)
-            else:
-                middle = round(yaw / (2.0 * np.pi) * _FINE)
-                shift = middle + rng.integers(-_COARSE, _COARSE + 1, 50)
+            shift = rng.integers(0, _FINE, 50)
             turned = fine[:, (every[None] - shift[:, None]) % _FINE]
-            support = turned.transpose(1, 0, 2) + (at @ _FEW.T)[:, None]
+            support = turned.transpose(1, 0, 2) + np.einsum("ti,di->td", at, _FEW)[:, None]
             free = np.flatnonzero(self._inside(support) & self._apart(support))
             if len(free):
                 k = int(free[0])
-                return self.put(piece, *at[k].tolist(), yaw=float(shift[k]) * 2.0 * np.pi / _FINE)
+                yaw = 2.0 * np.pi * float(shift[k]) / _FINE
+                place = Pose(float(at[k, 0]), float(at[k, 1]), yaw=yaw)
+                return self._stand(piece, support[k], place)
         return None
 
     def _inside(self, support: Array) -> NDArray[np.bool_]:
@@ -239,6 +244,11 @@ def _footprint(piece: Piece) -> list[Array]:
     """The corners (n, 2) of each part's hull seen from above."""
     flat = [part.solid.vertices[:, :2] for part in piece.parts]
     return [points[ConvexHull(points).vertices] for points in flat]
+
+
+def _support(hull: Array) -> Array:
+    """How far a hull (n, 2) reaches in each of the fine directions, m."""
+    return np.asarray(np.einsum("di,ni->dn", _DIRECTIONS, hull).max(axis=1))
 
 
 def drop(piece: Piece, onto: list[Solid]) -> float:

@@ -9,12 +9,12 @@ import numpy as np
 
 from sim.engine import mujoco
 from sim.scenes.arrangement import Piece, Plot, Pose, Shelf, drop
-from sim.scenes.household import (
-    CROCKERY,
+from sim.scenes.crockery import CROCKERY, bowl_shape
+from sim.scenes.machined import MACHINED, THREADS, block, bolt, bush, nut
+from sim.scenes.organic import (
     FRUIT,
     apple,
     banana,
-    bowl_shape,
     cushion,
     lemon,
     loaf,
@@ -24,7 +24,6 @@ from sim.scenes.household import (
     pumpkin,
     towel,
 )
-from sim.scenes.machined import MACHINED, THREADS, block, bolt, bush, nut
 from sim.scenes.rows import PANELS
 from sim.scenes.table import add_table
 from sim.scenes.tools import TOOLS, carton, crate, toolbox
@@ -35,7 +34,18 @@ def lab_1(seed: int) -> mujoco.MjSpec:
     """Boxes, tools and machined parts with holes."""
     spec, plot = _table(seed, "lab-1")
     rng = stream(seed, "lab-1", "pieces")
-    makers = [crate, carton, toolbox, carton, block, block, *MACHINED, *MACHINED, *TOOLS, *TOOLS[:4]]
+    makers = [
+        crate,
+        carton,
+        toolbox,
+        carton,
+        block,
+        block,
+        *MACHINED,
+        *MACHINED,
+        *TOOLS,
+        *TOOLS[:4],
+    ]
     pieces = [maker(rng) for maker in makers]
     for piece in sorted(pieces, key=_spread, reverse=True):
         pose = plot.scatter(rng, piece)
@@ -84,7 +94,7 @@ def lab_2(seed: int) -> mujoco.MjSpec:
     for piece in sorted(pieces, key=_spread, reverse=True):
         plot.scatter(rng, piece)
     small = [maker(rng) for maker in (pebble, pebble, pebble, pebble, potato, lemon)]
-    for k in range(18):
+    for k in range(15):
         plot.scatter(rng, small[k % len(small)])
     return spec
 
@@ -116,7 +126,8 @@ def lab_3(seed: int) -> mujoco.MjSpec:
     places = [(x, y) for y in (-0.25, 0.25) for x in (-0.375, -0.125, 0.125, 0.375)]
     for (x, y), number in zip(places, rng.permutation(len(PANELS)), strict=True):
         at = np.array([x, y]) * 2.0 * np.array(plot.half) + rng.uniform(-0.004, 0.004, 2)
-        panel = plot.at.at(Pose(*at.tolist(), yaw=np.radians(rng.uniform(-2.0, 2.0))))
+        yaw = np.radians(rng.uniform(-2.0, 2.0))
+        panel = plot.at.at(Pose(float(at[0]), float(at[1]), yaw=float(yaw)))
         for piece, pose in PANELS[number](rng):
             plot.bench.add(piece, panel.at(pose))
     return spec

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scenes.arrangement import Colour, Part, Piece, Shelf
+from sim.scenes.arrangement import Colour, Part, Piece, Shelf, pick
 from sim.scenes.solids import (
     LYING,
     UPRIGHT,
@@ -32,10 +32,6 @@ ANODISED: tuple[Colour, ...] = ((0.33, 0.335, 0.34), (0.06, 0.11, 0.27), (0.33, 
 CAST: tuple[Colour, ...] = ((0.10, 0.19, 0.15), (0.13, 0.17, 0.25), (0.16, 0.165, 0.17))
 
 
-def _pick(rng: np.random.Generator, choices: tuple[Colour, ...]) -> Colour:
-    return choices[int(rng.integers(len(choices)))]
-
-
 def _round_of(count: int, radius: float, hole: float, phase: float = 0.0) -> list[Array]:
     angles = phase + 2.0 * np.pi * np.arange(count) / count
     return [circle(hole, (radius * np.cos(a), radius * np.sin(a))) for a in angles]
@@ -50,7 +46,7 @@ def flange(rng: np.random.Generator) -> Piece:
     bolts = _round_of(count, 0.5 * (hub + r) + 0.002, min(0.007, 0.16 * (r - hub) + 0.003))
     disc = extrude(circle(r), thick, [circle(bore), *bolts])
     neck = extrude(circle(hub), tall, [circle(bore)], bottom=thick)
-    return Piece("flange", (Part(joined([disc, neck]), _pick(rng, STEEL), "steel"),))
+    return Piece("flange", (Part(joined([disc, neck]), pick(rng, STEEL), "steel"),))
 
 
 def bracket(rng: np.random.Generator) -> Piece:
@@ -70,7 +66,7 @@ def bracket(rng: np.random.Generator) -> Piece:
         turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         parts.append(extrude(rib, 0.5 * wall).moved((x, -b + wall, wall), turn))
     colour, material = (
-        (_pick(rng, STEEL), "steel") if rng.random() < 0.5 else (_pick(rng, CAST), "painted")
+        (pick(rng, STEEL), "steel") if rng.random() < 0.5 else (pick(rng, CAST), "painted")
     )
     return Piece("bracket", (Part(joined(parts), colour, material),))
 
@@ -94,7 +90,7 @@ def bearing_block(rng: np.random.Generator) -> Piece:
     return Piece(
         "bearing_block",
         (
-            Part(joined([housing, *feet]), _pick(rng, CAST), "painted"),
+            Part(joined([housing, *feet]), pick(rng, CAST), "painted"),
             Part(ring, STEEL[2], "polished"),
         ),
     )
@@ -110,13 +106,11 @@ def slotted_plate(rng: np.random.Generator) -> Piece:
     window = rounded(0.2 * a, 0.3 * b, 0.006, (-0.45 * a, 0.0))
     plate = extrude(rounded(a, b, 0.005), c, [*slots, *corners, window])
     tall = rng.uniform(0.014, 0.03)
-    boss = [
-        extrude(circle(0.011, (-0.45 * a, s * 0.62 * b)), tall, [circle(0.004, (-0.45 * a, s * 0.62 * b))], bottom=c)
-        for s in (-1, 1)
-    ]  # fmt: skip
+    spots = [(-0.45 * a, s * 0.62 * b) for s in (-1, 1)]
+    boss = [extrude(circle(0.011, at), tall, [circle(0.004, at)], bottom=c) for at in spots]
     bar = extrude(rectangle(0.5 * a, 0.12 * b, (0.3 * a, 0.0)), 0.6 * tall, bottom=c)
     return Piece(
-        "slotted_plate", (Part(joined([plate, *boss, bar]), _pick(rng, ANODISED), "steel"),)
+        "slotted_plate", (Part(joined([plate, *boss, bar]), pick(rng, ANODISED), "steel"),)
     )
 
 
@@ -134,7 +128,7 @@ def manifold(rng: np.random.Generator) -> Piece:
         extrude(outline, deep - sink, narrow, bottom=tall - deep),
         extrude(outline, sink, wide + taps, bottom=tall - sink),
     ]
-    return Piece("manifold", (Part(joined(body), _pick(rng, ANODISED), "steel"),))
+    return Piece("manifold", (Part(joined(body), pick(rng, ANODISED), "steel"),))
 
 
 def gear(rng: np.random.Generator) -> Piece:
@@ -150,14 +144,13 @@ def gear(rng: np.random.Generator) -> Piece:
     bore = 0.2 * pitch
     key = 0.28 * bore
     edge = np.arcsin(key / bore)
-    keyed = np.concatenate(
-        [arc((0.0, 0.0), bore, edge, 2.0 * np.pi - edge, 121), [[1.3 * bore, -key], [1.3 * bore, key]]]
-    )  # fmt: skip
+    keyway = [[1.3 * bore, -key], [1.3 * bore, key]]
+    keyed = np.concatenate([arc((0.0, 0.0), bore, edge, 2.0 * np.pi - edge, 121), keyway])
     thick, hub = rng.uniform(0.010, 0.018), rng.uniform(0.008, 0.016)
     light = _round_of(int(rng.choice([4, 5, 6])), 0.58 * pitch, 0.14 * pitch)
     disc = extrude(outline, thick, [keyed, *light])
     neck = extrude(circle(0.34 * pitch), hub, [keyed], bottom=thick)
-    colour = BRASS if rng.random() < 0.3 else _pick(rng, STEEL)
+    colour = BRASS if rng.random() < 0.3 else pick(rng, STEEL)
     return Piece("gear", (Part(joined([disc, neck]), colour, "steel"),))
 
 
@@ -192,7 +185,7 @@ def stepped_shaft(rng: np.random.Generator) -> Piece:
         profile += [[radius, 2.0 * long * z], [radius, 2.0 * long * end]]
     profile.append([0.0, 2.0 * long])
     solid = revolve(np.array(profile)).moved((-long, 0.0, 0.0), LYING)
-    return Piece("shaft", (Part(solid, _pick(rng, STEEL), "polished"),)).settled()
+    return Piece("shaft", (Part(solid, pick(rng, STEEL), "polished"),)).settled()
 
 
 def channel(rng: np.random.Generator) -> Piece:
@@ -231,9 +224,11 @@ def bolt_shape(size: float, length: float) -> Solid:
 @cache
 def bolt(size: float, length: float) -> Piece:
     """A hexagon bolt lying on head and shank."""
-    return Piece("bolt", (Part(bolt_shape(size, length), STEEL[0], "steel"),)).moved(
-        (0.0, 0.0, 0.0), LYING
-    ).settled()
+    return (
+        Piece("bolt", (Part(bolt_shape(size, length), STEEL[0], "steel"),))
+        .moved((0.0, 0.0, 0.0), LYING)
+        .settled()
+    )
 
 
 def bush(rng: np.random.Generator) -> Piece:
@@ -256,9 +251,7 @@ def motor(rng: np.random.Generator) -> Piece:
     ]
     shaft = extrude(circle(0.0035), 0.024, bottom=tall)
     octagon = polygon(1.0, 8)
-    core = extrude(
-        np.clip(octagon * 1.35 * a, -0.96 * a, 0.96 * a), tall - 2.0 * cap, bottom=cap
-    )
+    core = extrude(np.clip(octagon * 1.35 * a, -0.96 * a, 0.96 * a), tall - 2.0 * cap, bottom=cap)
     return Piece(
         "motor",
         (
@@ -273,7 +266,7 @@ def block(rng: np.random.Generator) -> Piece:
     """A ground parallel block others can stand on."""
     a, b, tall = rng.uniform(0.05, 0.08), rng.uniform(0.035, 0.05), rng.uniform(0.02, 0.045)
     solid: Solid = extrude(rounded(a, b, 0.002, arc=4), tall)
-    return Piece("block", (Part(solid, _pick(rng, STEEL), "steel"),), Shelf(a, b, tall))
+    return Piece("block", (Part(solid, pick(rng, STEEL), "steel"),), Shelf(a, b, tall))
 
 
 MACHINED: tuple[Callable[[np.random.Generator], Piece], ...] = (

@@ -12,13 +12,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scenes.arrangement import Colour, Part, Piece, Pose, drop
-from sim.scenes.household import vessel
+from sim.scenes.arrangement import Colour, Part, Piece, Pose, drop, pick
+from sim.scenes.crockery import vessel
 from sim.scenes.machined import ANODISED, STEEL, bolt_shape, bracket, nut
 from sim.scenes.solids import (
     UPRIGHT,
     arc,
-    about,
     circle,
     curve,
     extrude,
@@ -49,16 +48,19 @@ _PAINTS: tuple[Colour, ...] = (
 def _grid(columns: int, rows: int, pitch: float) -> Array:
     """The places (n, 2) of an even grid around the origin, m."""
     x, y = np.meshgrid(
-        (np.arange(columns) - 0.5 * (columns - 1)) * pitch, (np.arange(rows) - 0.5 * (rows - 1)) * pitch
+        (np.arange(columns) - 0.5 * (columns - 1)) * pitch,
+        (np.arange(rows) - 0.5 * (rows - 1)) * pitch,
     )
     return np.column_stack([x.ravel(), y.ravel()])
 
 
-def _set_out(rng: np.random.Generator, piece: Piece, places: Array, z: float = 0.0) -> Panel:
+def _set_out(
+    rng: np.random.Generator, piece: Piece, places: Array, z: float = 0.0, jitter: float = JITTER
+) -> Panel:
     """A piece at most of the places; one at least stays empty."""
     present = rng.random(len(places)) >= MISSING
     present[int(rng.integers(len(places)))] = False
-    shift = np.clip(rng.normal(size=(len(places), 2)), -2.0, 2.0) * JITTER
+    shift = np.clip(rng.normal(size=(len(places), 2)), -2.0, 2.0) * jitter
     yaw = np.radians(0.6) * np.clip(rng.normal(size=len(places)), -2.0, 2.0)
     return [
         (piece, Pose(float(x), float(y), z, float(a)))
@@ -79,14 +81,17 @@ def tube_rack(rng: np.random.Generator) -> Panel:
     rack = [
         extrude(rectangle(a, b), wall),
         extrude(rounded(a, b, 0.004), wall, holes, bottom=deck),
-        *(extrude(side + [s * (a - 0.5 * wall), 0.0], deck - wall, bottom=wall) for s in (-1, 1)),
+        *(
+            extrude(side + np.array([s * (a - 0.5 * wall), 0.0]), deck - wall, bottom=wall)
+            for s in (-1, 1)
+        ),
     ]
     bottom = arc((0.0, r), r, -0.5 * np.pi, 0.0, 12)
     bottom[0, 0] = 0.0
     rim = [[r, tall - 0.002], [r + 0.0006, tall - 0.001], [r + 0.0006, tall], [r - 0.001, tall]]
     bore = [[r - 0.001, 0.7 * tall], [0.0, 0.7 * tall]]
-    tube = revolve(np.concatenate([bottom, rim, bore]), 72)
-    colour = _PAINTS[int(rng.integers(4))]
+    tube = revolve(np.concatenate([bottom, rim, bore]), 64)
+    colour = pick(rng, _PAINTS)
     return [
         (Piece("rack", (Part(joined(rack), colour, "plastic"),)), Pose(0.0, 0.0)),
         *_set_out(
@@ -100,7 +105,7 @@ def cubes(rng: np.random.Generator) -> Panel:
     pitch, count = (0.052, 5) if rng.random() < 0.5 else (0.043, 6)
     half, tall = 0.31 * pitch, pitch * rng.uniform(0.6, 1.1)
     solid = extrude(rounded(half, half, 0.0015, arc=4), tall, [circle(0.4 * half)])
-    piece = Piece("cube", (Part(solid, _PAINTS[int(rng.integers(4))], "painted"),))
+    piece = Piece("cube", (Part(solid, pick(rng, _PAINTS), "painted"),))
     return _set_out(rng, piece, _grid(count, count, pitch))
 
 
@@ -128,26 +133,27 @@ def egg_tray(rng: np.random.Generator) -> Panel:
     height = 0.022 - 0.0085 * (np.cos(wave * x) + np.cos(wave * y))
     tray = sheet(height, half_x, half_y)
     r = rng.uniform(0.0205, 0.0215)
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 27)
     # Blunt below, pointed above.
     taper = 1.0 - 0.11 * np.sin(angle)
     egg_profile = np.column_stack([r * np.cos(angle) * taper, 1.32 * r * (1.0 + np.sin(angle))])
     egg_profile[[0, -1], 0] = 0.0
-    colour = ((0.40, 0.27, 0.18), (0.43, 0.41, 0.37))[int(rng.integers(2))]
-    egg = Piece("egg", (Part(revolve(egg_profile, 64), colour, "plastic"),))
+    colour = pick(rng, ((0.40, 0.27, 0.18), (0.43, 0.41, 0.37)))
+    egg = Piece("egg", (Part(revolve(egg_profile, 56), colour, "plastic"),))
     carton = Piece("egg_tray", (Part(tray, (0.22, 0.215, 0.20), "matt"),))
-    panel: Panel = [(carton, Pose(0.0, 0.0))]
-    for piece, pose in _set_out(rng, egg, _grid(columns, rows, pitch)):
-        above = piece.moved((pose.x, pose.y, 0.1), about(2, pose.yaw))
-        panel.append((piece, pose._replace(z=0.1 - drop(above, [tray]))))
-    return panel
+    # An egg finds the middle of its pocket, and all pockets are alike.
+    z = 0.1 - drop(egg.moved((0.0, 0.0, 0.1)), [tray])
+    eggs = _set_out(rng, egg, _grid(columns, rows, pitch), z, jitter=0.0)
+    return [(carton, Pose(0.0, 0.0)), *eggs]
 
 
 def brackets(rng: np.random.Generator) -> Panel:
     """Equal angle brackets, all facing one way."""
-    piece = bracket(rng)
+    large = bracket(rng)
+    parts = [part._replace(solid=part.solid.bent(lambda v: 0.68 * v)) for part in large.parts]
+    piece = Piece(large.kind, tuple(parts))
     flat = piece.solid().vertices[:, :2]
-    step = np.ptp(flat, axis=0) + 0.014
+    step = np.ptp(flat, axis=0) + 0.012
     counts = np.maximum((2.0 * np.array(PANEL) / step).astype(int), 1)
     return _set_out(rng, piece, _grid(int(counts[0]), int(counts[1]), 1.0) * step)
 
@@ -157,9 +163,9 @@ def jars(rng: np.random.Generator) -> Panel:
     pitch, count = 0.062, 4
     r, tall = 0.41 * pitch, rng.uniform(0.05, 0.085)
     side = curve([(0.85 * r, 0.0), (r, 0.0), (r, 0.01), (r, 0.5 * tall), (r, 0.8 * tall),
-                  (0.7 * r, 0.86 * tall), (0.7 * r, tall)])  # fmt: skip
-    solid = vessel(side, 0.003, 0.004, 96)
-    colour = ((0.38, 0.37, 0.35), (0.06, 0.12, 0.22), (0.12, 0.21, 0.16))[int(rng.integers(3))]
+                  (0.7 * r, 0.86 * tall), (0.7 * r, tall)], 0.006)  # fmt: skip
+    solid = vessel(side, 0.003, 0.004, 80)
+    colour = pick(rng, ((0.38, 0.37, 0.35), (0.06, 0.12, 0.22), (0.12, 0.21, 0.16)))
     piece = Piece("jar", (Part(solid, colour, "glazed"),))
     return _set_out(rng, piece, _grid(count, count, pitch))
 
@@ -168,7 +174,7 @@ def bolts(rng: np.random.Generator) -> Panel:
     """Equal bolts standing on their heads."""
     size, pitch = 0.016, 0.038
     solid = bolt_shape(size, rng.uniform(2.5, 3.5) * size)
-    piece = Piece("stud", (Part(solid, STEEL[int(rng.integers(3))], "steel"),))
+    piece = Piece("stud", (Part(solid, pick(rng, STEEL), "steel"),))
     return _set_out(rng, piece, _grid(7, 7, pitch))
 
 
@@ -185,7 +191,7 @@ def heat_sinks(rng: np.random.Generator) -> Panel:
             comb += [[right - 0.5 * step, base], [right - step, base]]
     outline = np.array([[-half, 0.0], [half, 0.0], *comb[1:]])
     solid = extrude(outline, 2.0 * half).moved((0.0, half, 0.0), UPRIGHT)
-    piece = Piece("heat_sink", (Part(solid, ANODISED[int(rng.integers(3))], "steel"),))
+    piece = Piece("heat_sink", (Part(solid, pick(rng, ANODISED), "steel"),))
     return _set_out(rng, piece, _grid(4, 4, pitch))
 
 

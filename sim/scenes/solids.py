@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -155,7 +156,7 @@ def _triangulated(rings: list[Array]) -> tuple[Array, Indices, Indices]:
         points = np.concatenate(rings)
         starts = np.cumsum([0, *(len(ring) for ring in rings)])
         after = np.concatenate([
-            np.roll(np.arange(a, b), -1) for a, b in zip(starts[:-1], starts[1:], strict=True)
+            np.roll(np.arange(a, b), -1) for a, b in pairwise(starts)
         ])  # fmt: skip
         middle, half = 0.5 * (points + points[after]), 0.5 * (points[after] - points)
         radius = np.linalg.norm(half, axis=1)
@@ -345,7 +346,7 @@ def lump(
 
 
 def sheet(height: Array, half_x: float, half_y: float) -> Solid:
-    """A body on its flat underside z = 0 whose top has the heights (rows, columns) m, along y, x."""
+    """A body on its flat underside z = 0 and a top of heights (rows, columns) m, along y, x."""
     rows, columns = height.shape
     y, x = np.meshgrid(
         np.linspace(-half_y, half_y, rows), np.linspace(-half_x, half_x, columns), indexing="ij"

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sim.scenes.arrangement import Colour, Part, Piece, Shelf
+from sim.scenes.arrangement import Colour, Part, Piece, Shelf, pick
 from sim.scenes.solids import (
     LYING,
-    arc,
     about,
+    arc,
     circle,
     curve,
     extrude,
@@ -34,10 +34,6 @@ CARDBOARD: tuple[Colour, ...] = ((0.30, 0.20, 0.115), (0.26, 0.17, 0.095), (0.34
 GRIPS = (RED, YELLOW, BLUE, GREEN)
 
 
-def _grip(rng: np.random.Generator) -> Colour:
-    return GRIPS[int(rng.integers(len(GRIPS)))]
-
-
 def hammer(rng: np.random.Generator) -> Piece:
     """A fitter's hammer lying on its side: head with face and peen, ash handle."""
     long, a, w = rng.uniform(0.25, 0.31), rng.uniform(0.045, 0.055), rng.uniform(0.013, 0.016)
@@ -45,13 +41,13 @@ def hammer(rng: np.random.Generator) -> Piece:
         [[-a, -w], [0.35 * a, -w], [0.95 * a, -0.15 * w], [a, 0.15 * w], [0.35 * a, w], [-a, w]]
     )
     head = extrude(outline, 2.0 * w, bottom=-w)
-    grip = curve([(0.010, 0.0), (0.010, 0.04), (0.016, 0.1), (0.013, 0.5), (0.010, 0.8), (0.010, 1.0)], 0.02)
+    grip = curve(
+        [(0.010, 0.0), (0.010, 0.04), (0.016, 0.1), (0.013, 0.5), (0.010, 0.8), (0.010, 1.0)], 0.02
+    )
     z = grip[:, 1] * long
     path = np.column_stack([np.zeros_like(z), w - z - 0.0, np.zeros_like(z)])[::-1]
     handle = tube(path, grip[::-1, 0] * 1.15, 48, flat=0.7)
-    return Piece(
-        "hammer", (Part(head, DARK_STEEL, "steel"), Part(handle, ASH, "wood"))
-    ).settled()
+    return Piece("hammer", (Part(head, DARK_STEEL, "steel"), Part(handle, ASH, "wood"))).settled()
 
 
 def spanner(rng: np.random.Generator) -> Piece:
@@ -93,7 +89,7 @@ def screwdriver(rng: np.random.Generator) -> Piece:
         np.array([[0.0, 0.1], [0.0032, 0.1], [0.0032, 0.1 + long], [0.0, 0.1 + long]]), 48
     )
     tip = extrude(rectangle(0.0045, 0.0007), 0.012, bottom=0.098 + long)
-    colour = _grip(rng)
+    colour = pick(rng, GRIPS)
     lie = LYING
     middle = (-0.5 * (0.1 + long), 0.0, 0.0)
     return Piece(
@@ -109,13 +105,24 @@ def calipers(rng: np.random.Generator) -> Piece:
     """Vernier calipers lying flat, opened a little."""
     gap = rng.uniform(0.01, 0.05)
     beam = extrude(rectangle(0.105, 0.008, (0.075, 0.0)), 0.0035, bottom=0.002)
-    fixed = np.array([[-0.030, -0.008], [0.0, -0.045], [0.0, 0.022], [-0.006, 0.010], [-0.030, 0.008]])
-    slide = np.array(
-        [[0.0, -0.045], [0.022, -0.013], [0.055, -0.013], [0.055, 0.011], [0.012, 0.011], [0.0, 0.022]]
+    fixed = np.array(
+        [[-0.030, -0.008], [0.0, -0.045], [0.0, 0.022], [-0.006, 0.010], [-0.030, 0.008]]
     )
-    jaws = [extrude(fixed, 0.0075), extrude(slide + [gap + 0.0005, 0.0], 0.0075)]
+    slide = np.array(
+        [
+            [0.0, -0.045],
+            [0.022, -0.013],
+            [0.055, -0.013],
+            [0.055, 0.011],
+            [0.012, 0.011],
+            [0.0, 0.022],
+        ]
+    )
+    jaws = [extrude(fixed, 0.0075), extrude(slide + np.array([gap + 0.0005, 0.0]), 0.0075)]
     knob = extrude(circle(0.005, (gap + 0.045, 0.013)), 0.0075)
-    return Piece("calipers", (Part(joined([beam, *jaws, knob]).moved((-0.07, 0, 0)), CHROME, "steel"),))
+    return Piece(
+        "calipers", (Part(joined([beam, *jaws, knob]).moved((-0.07, 0, 0)), CHROME, "steel"),)
+    )
 
 
 def pliers(rng: np.random.Generator) -> Piece:
@@ -123,7 +130,9 @@ def pliers(rng: np.random.Generator) -> Piece:
     spread = rng.uniform(0.10, 0.2)
     grips, steel = [], []
     for s in (-1.0, 1.0):
-        jaw = np.array([[-0.004, -0.010], [0.010, -0.0105], [0.048, -0.0045], [0.052, -0.0005], [-0.004, 0.0]])
+        jaw = np.array(
+            [[-0.004, -0.010], [0.010, -0.0105], [0.048, -0.0045], [0.052, -0.0005], [-0.004, 0.0]]
+        )
         jaw = jaw if s < 0 else (jaw * [1.0, -1.0])[::-1]
         steel.append(extrude(jaw, 0.010, bottom=0.0015))
         arm = curve(
@@ -136,7 +145,7 @@ def pliers(rng: np.random.Generator) -> Piece:
         grips.append(tube(path[first:], 0.0065, 32))
     steel.append(extrude(circle(0.012), 0.011, bottom=0.001))
     steel.append(extrude(circle(0.004), 0.013))
-    colour = _grip(rng)
+    colour = pick(rng, GRIPS)
     return Piece(
         "pliers", (Part(joined(steel), DARK_STEEL, "steel"), Part(joined(grips), colour, "rubber"))
     ).settled()
@@ -159,7 +168,7 @@ def tape_roll(rng: np.random.Generator) -> Piece:
     r, wide = rng.uniform(0.045, 0.06), rng.uniform(0.022, 0.045)
     tape = extrude(circle(r), wide, [circle(0.66 * r)])
     core = extrude(circle(0.66 * r), wide, [circle(0.62 * r)])
-    colour = (0.42, 0.40, 0.34) if rng.random() < 0.5 else _grip(rng)
+    colour = (0.42, 0.40, 0.34) if rng.random() < 0.5 else pick(rng, GRIPS)
     return Piece("tape", (Part(tape, colour, "plastic"), Part(core, CARDBOARD[0], "matt")))
 
 
@@ -172,7 +181,7 @@ def carton(rng: np.random.Generator) -> Piece:
     return Piece(
         "carton",
         (
-            Part(body, CARDBOARD[int(rng.integers(3))], "matt"),
+            Part(body, pick(rng, CARDBOARD), "matt"),
             Part(strip, (0.27, 0.19, 0.10), "plastic"),
             Part(label, (0.55, 0.55, 0.53), "matt"),
         ),
@@ -196,7 +205,7 @@ def crate(rng: np.random.Generator) -> Piece:
     if rng.random() < 0.5:
         colour, material = ASH, "wood"
     else:
-        colour, material = _grip(rng), "plastic"
+        colour, material = pick(rng, GRIPS), "plastic"
     return Piece("crate", (Part(joined([floor, *walls]), colour, material),), inside)
 
 
@@ -204,15 +213,19 @@ def toolbox(rng: np.random.Generator) -> Piece:
     """A small tool box with a ridged lid, a handle and two latches."""
     a, b, tall = rng.uniform(0.10, 0.13), rng.uniform(0.055, 0.07), rng.uniform(0.08, 0.11)
     lid = tall + 0.022
-    shell = [extrude(rounded(a, b, 0.006), tall), extrude(rounded(1.02 * a, 1.04 * b, 0.008), 0.022, bottom=tall)]
+    shell = [
+        extrude(rounded(a, b, 0.006), tall),
+        extrude(rounded(1.02 * a, 1.04 * b, 0.008), 0.022, bottom=tall),
+    ]
     arch = arc((0.0, 0.0), 1.0, 0.0, np.pi, 33) * [0.5 * a, 0.035]
     path = np.column_stack([arch[:, 0], np.zeros(33), lid - 0.004 + arch[:, 1]])
-    latches = [extrude(rectangle(0.012, 0.003, (s * 0.6 * a, -1.04 * b - 0.003)), 0.03, bottom=tall - 0.014)
-               for s in (-1, 1)]  # fmt: skip
+    front = -1.04 * b - 0.003
+    spots = [(s * 0.6 * a, front) for s in (-1, 1)]
+    latches = [extrude(rectangle(0.012, 0.003, at), 0.03, bottom=tall - 0.014) for at in spots]
     return Piece(
         "toolbox",
         (
-            Part(joined(shell), _grip(rng), "painted"),
+            Part(joined(shell), pick(rng, GRIPS), "painted"),
             Part(tube(path, 0.005, 32), BLACK, "plastic"),
             Part(joined(latches), CHROME, "polished"),
         ),
