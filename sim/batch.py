@@ -162,7 +162,7 @@ def _checked(
         raise OptionError(f"workers {workers}: expected 1 or more")
     entry = find_scene(scene)
     sensor_of(entry, options)
-    choose_stages(options.clean, options.without)
+    choose_stages(options.clean, options.without, options.white)
     find_rig(options.rig or entry.rig)
     if scheduler is not None and Path(scene).is_file() and not Path(scene).is_absolute():
         raise OptionError(

@@ -46,7 +46,7 @@ class Capture:
     def plan(cls, entry: Scene, options: GenerateOptions) -> Capture:
         """Build the scene and plan the poses; SimulationError names an unknown sensor or stage."""
         sensor = sensor_of(entry, options)
-        stages = choose_stages(options.clean, options.without)
+        stages = choose_stages(options.clean, options.without, options.white)
         rig = find_rig(options.rig or entry.rig)
         world = World.build(entry, options.seed, options.settled)
         scale = 0.0 if options.clean else options.pose_noise

@@ -19,6 +19,7 @@ from depthba.durable import write_bytes, write_json, write_text
 from depthba.errors import DatasetError
 from sim.capture import Capture
 from sim.markers import discs_of, observe
+from sim.noise import stated_noise
 from sim.options import DEFAULTS, GenerateOptions
 from sim.scenes import Scene, find_scene
 
@@ -184,8 +185,9 @@ def _header(scene: str, entry: Scene, capture: Capture) -> dict[str, Any]:
         "seed": options.seed,
         "source": _source(scene, options),
     }
-    if any(stage.name in ("range-noise", "disparity-noise") for stage in capture.stages):
-        header["sensor"]["noise"] = asdict(sensor.noise)
+    noise = stated_noise(sensor, capture.stages)
+    if noise is not None:
+        header["sensor"]["noise"] = asdict(noise)
     if track.sigma_t is not None and track.sigma_r is not None:
         header["pose_noise"] = {
             "sigma_t_m": list(track.sigma_t),

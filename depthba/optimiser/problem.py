@@ -190,7 +190,10 @@ def _crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDAr
 def _sigma(noise: RangeNoise | None, points: NDArray[np.float32]) -> NDArray[np.float64]:
     if noise is None:
         return np.ones(len(points))
-    return np.asarray(noise.sigma(points[:, 2].astype(float)))
+    sigma = noise.sigma(points[:, 2].astype(float))
+    if noise.along == "z":  # an error of z moves the point along its ray by that much more
+        sigma = sigma * np.linalg.norm(points, axis=1) / np.maximum(points[:, 2], 1e-9)
+    return np.asarray(sigma)
 
 
 def _frame(points: NDArray[np.float32], weight: NDArray[np.float64], sensor: Sensor) -> FramePoints:

@@ -27,6 +27,7 @@ from sim.noise.outlines import FlyingPixels, LateralJitter, Shadow
 from sim.noise.shot import Shot
 from sim.noise.stage import Stage
 from sim.noise.storage import Quantisation, RangeLimits
+from sim.noise.white import WhiteNoise
 from sim.seeds import stream
 from sim.sensors import DepthSensor
 
@@ -45,17 +46,23 @@ STAGES: tuple[Stage, ...] = (
     Quantisation(),
 )
 
+WHITE: tuple[Stage, ...] = (WhiteNoise(), RangeLimits(), Quantisation())
+"""For studies: the sensor's sigma, independent in every pixel, and nothing else."""
 
-def choose_stages(clean: bool = False, without: tuple[str, ...] = ()) -> tuple[Stage, ...]:
+
+def choose_stages(
+    clean: bool = False, without: tuple[str, ...] = (), white: bool = False
+) -> tuple[Stage, ...]:
     """The stages in their order, less the noise (`clean`) and those named in `without`.
 
-    SimulationError lists the names where one is unknown.
+    `white` takes those of `WHITE`. SimulationError lists the names where one is unknown.
     """
-    names = [stage.name for stage in STAGES]
+    stages = WHITE if white else STAGES
+    names = [stage.name for stage in stages]
     for name in without:
         if name not in names:
             raise SimulationError(f"unknown noise stage {name!r}; choose from: {', '.join(names)}")
-    return tuple(s for s in STAGES if s.name not in without and not (clean and s.is_noise))
+    return tuple(s for s in stages if s.name not in without and not (clean and s.is_noise))
 
 
 def measure(
@@ -95,6 +102,8 @@ def stated_noise(sensor: DepthSensor, stages: tuple[Stage, ...] = STAGES) -> Ran
         "fixed-pattern": sensor.pattern**2,
     }
     names = [stage.name for stage in stages]
+    if "white-noise" in names:
+        return replace(sensor.noise, along="range")
     if "disparity-noise" not in names:
         return None
     absent = sum(part for name, part in parts.items() if name not in names)

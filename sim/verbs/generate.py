@@ -54,6 +54,8 @@ class Noise:
 
     clean: bool = False
     """Leave all noise out, of the depth and of the poses; --start-error still counts."""
+    white: bool = False
+    """For studies: the sensor's sigma along the ray, in every pixel for itself, no other fault."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STAGE ...")] = ()
     """Stages of the sensor's noise to leave out, see --list."""
     stages: bool = False
@@ -202,6 +204,7 @@ def options_of(arguments: Arguments) -> GenerateOptions:
         start_error=noise.start_error,
         clean=noise.clean,
         pose_noise=noise.pose_noise,
+        white=noise.white,
         without=noise.without,
         sensor=capture.sensor,
         rig=capture.rig,

@@ -94,7 +94,7 @@ def own_model(tmp_path: Path) -> Path:
     model = tmp_path / "yard.xml"
     model.write_text(
         """<mujoco model="yard"><compiler meshdir="meshes"/><asset><mesh file="tent.obj"/>
-        <texture name="tile" type="2d" file="../tile.png"/><material name="m" texture="tile"/>
+        <texture name="tile" type="2d" file="meshes/../tile.png"/><material name="m" texture="tile"/>
         </asset><worldbody><geom type="plane" size="3 3 .1" material="m"/>
         <geom type="mesh" mesh="tent" pos="0.1 0.2 0"/>
         <body pos="-0.5 0 0.2"><freejoint/><geom size="0.2"/></body></worldbody></mujoco>"""

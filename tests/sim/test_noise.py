@@ -137,3 +137,22 @@ def test_unknown_names_list_the_choices() -> None:
         choose_stages(without=("fog",))
     with pytest.raises(SimulationError, match=r"'zed9'.*sp1000, zed2"):
         find_sensor("zed9")
+
+
+@pytest.mark.parametrize("z", [1.2, 3.0])
+def test_white_noise_is_of_the_stated_sigma_along_the_ray(z: float) -> None:
+    stages = choose_stages(white=True)
+    assert [stage.name for stage in stages] == ["white-noise", "range-limits", "quantisation"]
+    exact = np.full(SHOT.hits.distance.shape, z)
+    error = (measure(exact, SHOT, 1, 0, stages[:1]) - z) * np.linalg.norm(
+        SENSOR.camera.rays(), axis=-1
+    )
+    stated = stated_noise(SENSOR, stages)
+    assert stated is not None and stated.along == "range"
+    assert error.std() == pytest.approx(stated.sigma(z), rel=0.01)
+    assert abs(error.mean()) < 5 * error.std() / np.sqrt(error.size)
+    for axis in (0, 1):
+        beside = np.roll(error, 1, axis)
+        assert abs(np.mean(error * beside)) < 0.02 * error.var()
+    # In every direction the same: at the rim as in the middle.
+    assert error[:40, :40].std() == pytest.approx(error[100:140, 140:180].std(), rel=0.1)
