@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.noise import Stage, choose_stages, measure
+from sim.noise import choose_stages, measure
 from sim.noise.shot import Shot
+from sim.noise.stage import Stage
 from sim.options import GenerateOptions
 from sim.rigs import find_rig
 from sim.rigs.track import Track

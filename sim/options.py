@@ -28,7 +28,7 @@ class GenerateOptions:
     pose_noise: float = 1.0
     """Factor on the rig's pose errors."""
     white: bool = False
-    """For studies: the sensor's sigma along the ray, in every pixel for itself, and no other fault."""
+    """For studies: the sensor's sigma along the ray, each pixel for itself, and no other fault."""
     without: tuple[str, ...] = ()
     """Stages of the sensor's noise to leave out, by name."""
     sensor: str | None = None

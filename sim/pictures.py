@@ -60,6 +60,7 @@ def draw_scene(scene: str, path: str | Path, seed: int = 0, frame: int | None = 
     axes[0].imshow(image)
     _draw_frusta(axes[0], capture, camera, T, frame)
     axes[0].set_title(f"{scene}, seed {seed}: the scene and its {len(capture)} frames")
+    assert taken.rgb is not None
     axes[1].imshow(taken.rgb)
     axes[1].set_title(f"frame {frame}: colour")
     shown = axes[2].imshow(taken.depth, cmap="turbo", interpolation="nearest")
