@@ -95,10 +95,13 @@ class Relief:
         bottom, top = _span(planes, dx, dy)
         self.z[where] = np.where(top >= bottom, np.maximum(self.z[where], top + z), self.z[where])
 
-    def bed(self, planes: Array, x: float, y: float, radius: float, sink: float) -> float:
+    def bed(
+        self, planes: Array, x: float, y: float, radius: float, sink: float, raising: bool = True
+    ) -> float:
         """Lay a convex body down at (x, y) and lift the surface to its top; returns its height.
 
-        It lies where a share `sink` of its underside has sunk into what was there.
+        It lies where a share `sink` of its underside has sunk into what was there. With `raising`
+        False the surface stays as it was.
         """
         where, dx, dy = self.window(x, y, radius)
         bottom, top = _span(planes, dx, dy)
@@ -109,7 +112,8 @@ class Relief:
             return float(self.at(x, y))
         order = int((1.0 - sink) * (len(touch) - 1))
         z = float(np.partition(touch, order)[order])
-        self.z[where] = np.where(inside, np.maximum(old, top + z), old)
+        if raising:
+            self.z[where] = np.where(inside, np.maximum(old, top + z), old)
         return z
 
 

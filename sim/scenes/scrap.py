@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 RUST = ((0.18, 0.082, 0.045), (0.13, 0.065, 0.042), (0.22, 0.115, 0.065))
 STEEL = ((0.17, 0.175, 0.185), (0.12, 0.125, 0.135), (0.22, 0.22, 0.222))
+PALETTES = {"rust": RUST, "steel": STEEL}
+"""Colours, linear RGB, by the name of the material."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,13 @@ def add_body(
     rotation: Array,
     position: Array,
     colours: list[Array],
+    material: str,
     name: str = "",
 ) -> None:
-    """Place a body (underside's centre at `position`), and lift the relief to its bounding box."""
+    """Place a body (underside's centre at `position`), and lift the relief to its bounding box.
+
+    `colours` is linear RGB per part; `material` names one of the model's.
+    """
     for number, (part, colour) in enumerate(zip(body.parts, colours, strict=True)):
         cos, sin = np.cos(part.tilt), np.sin(part.tilt)
         turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
@@ -122,6 +128,7 @@ def add_body(
             pos=position + rotation @ np.array(part.position, float),
             quat=quaternion,
             rgba=[*np.clip(colour, 0.0, 1.0), 1.0],
+            material=material,
         )
     centre = position + rotation[:, 2] * body.half[2]
     planes = turned(box_planes(body.half), rotation)
@@ -136,14 +143,19 @@ def scatter_scrap(
     area: tuple[float, float, float, float],
     keep: tuple[Keep, ...],
 ) -> None:
-    """Lay pieces of scrap on the relief, where the loader has driven them into the fines."""
-    for _ in range(count):
+    """Lay pieces of scrap on the relief, where the loader has driven them into the fines.
+
+    Each piece takes the same numbers from `rng` whether or not it is kept.
+    """
+    for number in range(count):
         body = KINDS[int(rng.integers(len(KINDS)))](rng)
         x, y = rng.uniform(area[0], area[1]), rng.uniform(area[2], area[3])
         yaw = rng.uniform(0.0, 2.0 * np.pi)
-        palette = RUST if rng.random() < 0.7 else STEEL
+        material = "rust" if rng.random() < 0.7 else "steel"
+        palette = PALETTES[material]
         colour = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.8, 1.2)
         if any(np.hypot(k.x - x, k.y - y) < k.radius + body.half[0] for k in keep):
             continue
         rotation, position = rest_on_three(relief, x, y, yaw, body.half[:2], pressed=1.0)
-        add_body(spec, relief, body, rotation, position, [colour] * len(body.parts))
+        colours = [colour] * len(body.parts)
+        add_body(spec, relief, body, rotation, position, colours, material, f"scrap_{number}")

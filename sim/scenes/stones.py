@@ -28,6 +28,8 @@ class Family:
     """True: rounded lumps (slag). False: flat facets (crushed stone)."""
     colours: tuple[tuple[float, float, float], ...]
     """Reflectances to choose from, linear RGB."""
+    material: str = ""
+    """Name of the model's material that says how it shines; none: matt."""
 
 
 CRUSHED = Family(
@@ -36,7 +38,12 @@ CRUSHED = Family(
     ((0.24, 0.225, 0.20), (0.18, 0.178, 0.175), (0.30, 0.28, 0.245), (0.21, 0.18, 0.15)),
 )
 CHIPS = Family("chip", False, CRUSHED.colours)
-SLAG = Family("slag", True, ((0.085, 0.082, 0.086), (0.12, 0.105, 0.095), (0.15, 0.10, 0.072)))
+SLAG = Family(
+    "slag", True, ((0.085, 0.082, 0.086), (0.12, 0.105, 0.095), (0.15, 0.10, 0.072)), "slag"
+)
+
+LOOSE = "loose_"
+"""Names of geoms that nothing holds but their weight begin so."""
 
 
 @dataclass(frozen=True)
@@ -135,74 +142,81 @@ def scatter(
     area: tuple[float, float, float, float],
     keep: tuple[Keep, ...] = (),
     repose: float = np.radians(37.0),
+    name: str = "stone",
 ) -> None:
     """Drop stones one after another on the relief, each bedded into what already lies there.
 
     A stone that lands on a slope beyond the angle of repose rolls downhill until it is flatter, so
-    heaps keep the look of tipped material. `area` is (xmin, xmax, ymin, ymax) m.
+    heaps keep the look of tipped material. `area` is (xmin, xmax, ymin, ymax) m. Each stone takes
+    the same numbers from `rng` whether or not it is kept: the others do not depend on it. They are
+    called `loose_NAME_NUMBER`, and `settle` lets them fall.
     """
     by_size = sorted(shapes, key=lambda shape: shape.diameter)
     sizes = np.array([shape.diameter for shape in by_size])
     centres = np.array([[k.x, k.y, k.radius, k.above] for k in keep]).reshape(-1, 4)
-    for diameter in diameters:
+    for number, diameter in enumerate(diameters):
         size = sizes[np.abs(sizes - diameter).argmin()]
         first, last = np.searchsorted(sizes, [0.999 * size, 1.001 * size])
         shape = by_size[int(rng.integers(first, last))]
-        place = _place(rng, relief, shape.diameter, area, centres, repose)
-        if place is None:
-            continue
-        x, y = place
-        rotation = _lie(rng, relief.slope(x, y, 0.5 * shape.diameter))
-        planes = turned(shape.hull.planes, rotation)
-        z = relief.bed(planes, x, y, shape.reach, rng.uniform(0.80, 0.94))
+        # Loads are tipped in heaps: of two places a stone often takes the higher.
+        xs, ys = rng.uniform(area[0], area[1], 2), rng.uniform(area[2], area[3], 2)
+        choosy = rng.random() < 0.4
+        tilt, heading = rng.normal(scale=0.16, size=3), rng.uniform(0.0, 2.0 * np.pi)
+        sink = rng.uniform(0.80, 0.94)
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
-        add_mesh_geom(spec, shape.mesh, np.array([x, y, z]), rotation, colour)
+        pick = int(np.argmax(relief.at(xs, ys))) if choosy else 0
+        x, y = _roll(relief, float(xs[pick]), float(ys[pick]), shape.diameter, repose)
+        inside = area[0] <= x <= area[1] and area[2] <= y <= area[3]
+        near = np.hypot(centres[:, 0] - x, centres[:, 1] - y) < centres[:, 2] + 0.5 * shape.diameter
+        if not inside or (near & (shape.diameter > centres[:, 3])).any():
+            continue
+        rotation = _lie(relief.slope(x, y, 0.5 * shape.diameter), tilt, heading)
+        planes = turned(shape.hull.planes, rotation)
+        z = relief.bed(planes, x, y, shape.reach, sink)
+        add_mesh_geom(
+            spec, shape.mesh, np.array([x, y, z]), rotation, colour,
+            f"{LOOSE}{name}_{number}", shape.family.material,
+        )  # fmt: skip
 
 
-def _place(
-    rng: np.random.Generator,
-    relief: Relief,
-    diameter: float,
-    area: tuple[float, float, float, float],
-    keep: Array,
-    repose: float,
-) -> tuple[float, float] | None:
-    # Loads are tipped in heaps: of two places a stone often takes the higher.
-    xs, ys = rng.uniform(area[0], area[1], 2), rng.uniform(area[2], area[3], 2)
-    pick = int(np.argmax(relief.at(xs, ys))) if rng.random() < 0.4 else 0
-    x, y = float(xs[pick]), float(ys[pick])
+def _roll(
+    relief: Relief, x: float, y: float, diameter: float, repose: float
+) -> tuple[float, float]:
     for _ in range(12):
         gradient = relief.slope(x, y, 0.6 * diameter)
         steep = float(np.hypot(*gradient))
         if steep < np.tan(repose):
             break
         x, y = (np.array([x, y]) - 0.5 * diameter * gradient / steep).tolist()
-    inside = area[0] <= x <= area[1] and area[2] <= y <= area[3]
-    near = np.hypot(keep[:, 0] - x, keep[:, 1] - y) < keep[:, 2] + 0.5 * diameter
-    if not inside or (near & (diameter > keep[:, 3])).any():
-        return None
     return x, y
 
 
-def _lie(rng: np.random.Generator, gradient: Array) -> Array:
-    """A rotation that lays the flat side on the slope, give or take, with any heading."""
+def _lie(gradient: Array, tilt: Array, heading: float) -> Array:
+    """A rotation that lays the flat side on the slope, give or take `tilt` (3,)."""
     up = np.array([-gradient[0], -gradient[1], 1.0])
-    up = up / np.linalg.norm(up) + rng.normal(scale=0.16, size=3)
-    heading = rng.uniform(0.0, 2.0 * np.pi)
+    up = up / np.linalg.norm(up) + tilt
     return frame(up, np.array([np.cos(heading), np.sin(heading), 0.0]))
 
 
 def add_mesh_geom(
-    spec: mujoco.MjSpec, mesh: str, position: Array, rotation: Array, colour: Array
+    spec: mujoco.MjSpec,
+    mesh: str,
+    position: Array,
+    rotation: Array,
+    colour: Array,
+    name: str = "",
+    material: str = "",
 ) -> None:
     """Place a mesh of the model in the world; colour is linear RGB (3,)."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
     spec.worldbody.add_geom(
+        name=name,
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname=mesh,
         pos=position,
         quat=quaternion,
         rgba=[*np.clip(colour, 0.0, 1.0), 1.0],
+        material=material,
     )
