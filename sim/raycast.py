@@ -6,20 +6,19 @@ in double precision. Directions with camera z = 1 make the distance the depth. N
 
 from __future__ import annotations
 
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba.camera import Camera
-from depthba.errors import MissingPackage
+from sim import embree
 from sim.engine import mujoco
 from sim.tessellate import SEGMENTS, Triangles, triangles_of
 
 Array = NDArray[np.float64]
-
-MISS = 1e30
-"""Embree reports 1e37 for a ray that meets nothing."""
 
 
 @dataclass(frozen=True)
@@ -45,24 +44,17 @@ class RayScene:
 
     def __init__(self, triangles: Triangles) -> None:
         """Build the acceleration structure; MissingPackage if embreex is not there."""
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise MissingPackage(
-                f"embreex is not installed ({error}): pip install 'depthba[sim]'"
-            ) from error
         self.triangles = triangles
-        corner = triangles.vertices[triangles.faces]
-        self._corner = np.ascontiguousarray(corner[:, 0])
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        self.normals: Array = normal / np.where(length > 0.0, length, 1.0)
-        """(m, 3) outward unit normals of the triangles, world frame."""
-        self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(
-            self._scene, triangles.vertices.astype(np.float32), triangles.faces.astype(np.int32)
+        self._plane = np.empty((len(triangles.faces), 4))
+        _planes(triangles.vertices, triangles.faces, self._plane)
+        self._embree = embree.build(
+            triangles.vertices.astype(np.float32), triangles.faces.astype(np.int32)
         )
+
+    @property
+    def normals(self) -> Array:
+        """(m, 3) outward unit normals of the triangles, world frame."""
+        return self._plane[:, :3]
 
     @classmethod
     def of_model(
@@ -79,32 +71,174 @@ class RayScene:
         return cls(triangles_of(model, data, groups, segments))
 
     def cast(self, origins: Array, directions: Array) -> Hits:
-        """Shoot rays from origins (3,) or (..., 3) along directions (..., 3), world frame, m."""
+        """Shoot rays from origins (3,) or (..., 3) along directions (..., 3), world frame, m.
+
+        Rays that are neighbours in memory should be neighbours in space: they go faster.
+        """
         shape = directions.shape[:-1]
         d = np.ascontiguousarray(directions.reshape(-1, 3), float)
-        o = np.broadcast_to(origins, directions.shape).reshape(-1, 3)
-        found = np.asarray(
-            self._scene.run(np.ascontiguousarray(o, np.float32), d.astype(np.float32)), np.int64
-        )
-        hit = found >= 0
-        triangle = found[hit]
-        normal = self.normals[triangle]
-        # The plane's distance along the ray; the float32 answer would be good to a micrometre.
-        above = np.einsum("ij,ij->i", self._corner[triangle] - o[hit], normal)
-        towards = np.einsum("ij,ij->i", d[hit], normal)
-        distance = np.full(len(d), np.nan)
-        geom = np.full(len(d), -1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance[hit] = above / towards
-        geom[hit] = self.triangles.geom[triangle]
-        return Hits(distance.reshape(shape), found.reshape(shape), geom.reshape(shape))
+        o = np.atleast_2d(np.asarray(origins, float))
+        if len(o) > 1 or o.ndim > 2:
+            o = np.broadcast_to(o, directions.shape).reshape(-1, 3)
+        found = self._embree.first(o.astype(np.float32), d.astype(np.float32))
+        hits = _nothing(len(d))
+        _measure(found, o, d, self._plane, self.triangles.geom, *hits)
+        distance, triangle, geom = hits
+        return Hits(distance.reshape(shape), triangle.reshape(shape), geom.reshape(shape))
 
     def view(self, camera: Camera, T_world_camera: Array) -> Hits:
         """One ray through each pixel's centre: `distance` (height, width) is the exact depth, m."""
-        return self.cast(T_world_camera[:3, 3], world_rays(camera, T_world_camera))
+        if self._embree.handle is None:
+            return self.cast(T_world_camera[:3, 3], world_rays(camera, T_world_camera))
+        hits = _nothing((camera.height, camera.width))
+        T = np.ascontiguousarray(T_world_camera, float)
+        _view(self._embree.handle, camera.rays(), T, self._plane, self.triangles.geom, *hits)
+        return Hits(*hits)
 
-    def blocked(self, points: NDArray[np.floating], direction: Array) -> NDArray[np.bool_]:
-        """Whether anything stands in the way from points (n, 3) along one direction (3,)."""
-        o = np.ascontiguousarray(points, np.float32)
-        d = np.ascontiguousarray(np.broadcast_to(direction, points.shape), np.float32)
-        return np.asarray(self._scene.run(o, d, query="OCCLUDED")) >= 0
+    def incidence(self, camera: Camera, T_world_camera: Array, hits: Hits) -> Array:
+        """Cosine of the angle (height, width) between each pixel's ray and the surface's normal.
+
+        1: seen straight on, 0: along the surface, NaN: nothing seen.
+        """
+        cosine = np.empty(hits.triangle.shape)
+        T = np.ascontiguousarray(T_world_camera, float)
+        _incidence(hits.triangle, camera.rays(), T, self._plane, cosine)
+        return cosine
+
+    def normals_of(self, hits: Hits, T_world_camera: Array | None = None) -> Array:
+        """Unit normals (..., 3) of the surfaces hit, outward; NaN where nothing was hit.
+
+        In world axes, or in the camera's where its pose is given.
+        """
+        normal = self.normals[np.maximum(hits.triangle, 0)]
+        if T_world_camera is not None:
+            normal = np.einsum("...i,ij->...j", normal, T_world_camera[:3, :3])
+        return np.where(hits.triangle[..., None] >= 0, normal, np.nan)
+
+    def blocked(
+        self,
+        points: NDArray[np.floating],
+        direction: NDArray[np.floating],
+        reach: float | NDArray[np.floating] = np.inf,
+    ) -> NDArray[np.bool_]:
+        """Whether anything stands in the way from points (n, 3) along direction (3,) or (n, 3).
+
+        `reach`, one or (n,), says how far to look, in lengths of the direction. What begins at the
+        point itself counts: start a little off the surface. A point that is NaN is not blocked.
+        """
+        return self._embree.blocked(
+            np.ascontiguousarray(points, np.float32),
+            np.atleast_2d(np.ascontiguousarray(direction, np.float32)),
+            np.atleast_1d(np.asarray(reach, np.float32)),
+        )
+
+    def visible_from(self, points: Array, eye: Array) -> NDArray[np.bool_]:
+        """Whether points (..., 3) on surfaces can be seen from eye (3,); False for NaN.
+
+        The last ten-thousandth of the way does not count: there lies the surface itself.
+        """
+        p = points.reshape(-1, 3)
+        hidden = self._embree.blocked(
+            np.asarray(eye, np.float32)[None],
+            np.ascontiguousarray(p - eye, np.float32),
+            np.array([1.0 - NEAR_THE_SURFACE], np.float32),
+        )
+        return np.asarray((~hidden & np.isfinite(p).all(axis=1)).reshape(points.shape[:-1]))
+
+
+NEAR_THE_SURFACE = 1e-4
+"""Share of a line of sight before its end that is not searched for obstacles."""
+
+
+def _nothing(shape: int | tuple[int, ...]) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    return np.empty(shape), np.empty(shape, np.int64), np.empty(shape, np.int64)
+
+
+@nb.njit(cache=True, nogil=True)
+def _planes(vertices, faces, plane):
+    """Fill each triangle's plane (m, 4): outward unit normal n and n.p of its points p."""
+    for k in range(len(faces)):
+        a, b, c = vertices[faces[k, 0]], vertices[faces[k, 1]], vertices[faces[k, 2]]
+        x = (b[1] - a[1]) * (c[2] - a[2]) - (b[2] - a[2]) * (c[1] - a[1])
+        y = (b[2] - a[2]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[2] - a[2])
+        z = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        length = np.sqrt(x * x + y * y + z * z)
+        scale = 1.0 / length if length > 0.0 else 0.0
+        plane[k, 0], plane[k, 1], plane[k, 2] = x * scale, y * scale, z * scale
+        plane[k, 3] = (x * a[0] + y * a[1] + z * a[2]) * scale
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _along(plane, k, ox, oy, oz, dx, dy, dz):
+    """Distance to a triangle's plane along a ray; NaN where they are parallel."""
+    n = plane[k]
+    towards = n[0] * dx + n[1] * dy + n[2] * dz
+    if towards == 0.0:
+        return np.nan
+    return (n[3] - n[0] * ox - n[1] * oy - n[2] * oz) / towards
+
+
+@nb.njit(cache=True, nogil=True)
+def _measure(found, origins, directions, plane, owner, distance, triangle, geom):
+    """Fill distance, triangle and geom of rays (n,) that found these triangles."""
+    one = 0 if len(origins) == 1 else 1
+    for i in range(len(found)):
+        k = found[i]
+        o, d = origins[i * one], directions[i]
+        distance[i] = _along(plane, k, o[0], o[1], o[2], d[0], d[1], d[2]) if k >= 0 else np.nan
+        seen = k >= 0 and not np.isnan(distance[i])
+        triangle[i] = k if seen else -1
+        geom[i] = owner[k] if seen else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _view(handle, rays, T, plane, owner, distance, triangle, geom):
+    """Fill distance, triangle and geom (height, width) of a camera's rays, by squares of 4 x 4."""
+    floats, ints, valid = embree.new_packet()
+    directions = np.empty((embree.LANES, 3))
+    height, width = distance.shape
+    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
+    floats[0], floats[1], floats[2] = ox, oy, oz
+    for top in range(0, height, 4):
+        for left in range(0, width, 4):
+            for lane in range(embree.LANES):
+                y, x = top + lane // 4, left + lane % 4
+                valid[0, lane] = 0
+                if y < height and x < width:
+                    a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
+                    valid[0, lane] = -1 if np.isfinite(a + b + c) else 0
+                    for r in range(3):
+                        d = T[r, 0] * a + T[r, 1] * b + T[r, 2] * c
+                        directions[lane, r] = d
+                        floats[4 + r, lane] = d
+            embree.intersect(handle, floats, ints, valid)
+            for lane in range(embree.LANES):
+                y, x = top + lane // 4, left + lane % 4
+                if y >= height or x >= width:
+                    continue
+                k = ints[17, lane] if ints[18, lane] >= 0 else -1
+                t = np.nan
+                if k >= 0:
+                    d = directions[lane]
+                    t = _along(plane, k, ox, oy, oz, d[0], d[1], d[2])
+                seen = not np.isnan(t)
+                distance[y, x] = t
+                triangle[y, x] = k if seen else -1
+                geom[y, x] = owner[k] if seen else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _incidence(triangle, rays, T, plane, cosine):
+    for y in range(triangle.shape[0]):
+        for x in range(triangle.shape[1]):
+            k = triangle[y, x]
+            if k < 0:
+                cosine[y, x] = np.nan
+                continue
+            # The normal in the camera's axes.
+            total = 0.0
+            for c in range(3):
+                n = plane[k, 0] * T[0, c] + plane[k, 1] * T[1, c] + plane[k, 2] * T[2, c]
+                total += n * rays[y, x, c]
+            a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
+            cosine[y, x] = abs(total) / np.sqrt(a * a + b * b + c * c)
