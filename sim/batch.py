@@ -117,7 +117,7 @@ def generate_many(
                 folder, own = out / f"{name}-{seed:06d}", replace(options, seed=seed)
                 if not is_complete(scene, folder, own):
                     works.append(Work(scene, folder, own, batch, token))
-            report(count - len(works), count, "generating")
+            report(count - len(works), count, "starting" if works else "nothing to do")
             failed: list[Failure] = []
             if works:
                 staff: Workers = (
@@ -179,6 +179,7 @@ def _make_all(
     failed: list[Failure] = []
     now = True  # until all is done
     try:
+        report(count - len(works), count, staff.state())
         while queue or running:
             for _ in range(min(staff.room(), len(queue))):
                 work = queue.popleft()
@@ -192,7 +193,7 @@ def _make_all(
                     queue.append(work)  # behind the others: what was amiss may be over by then
                 elif error is not None:
                     failed.append(Failure(seed, error))
-            text = f"generating, {len(failed)} failed" if failed else "generating"
+            text = f"{staff.state()}, {len(failed)} failed" if failed else staff.state()
             report(count - len(queue) - len(running), count, text)
         now = False
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -29,6 +30,9 @@ _CONNECT = 15
 
 class Workers(Protocol):
     """Takes work, each piece for one worker."""
+
+    def state(self) -> str:
+        """What goes on, in a word or two."""
 
     def room(self) -> int:
         """How many more pieces of work it takes now."""
@@ -66,6 +70,10 @@ class LocalWorkers:
         self._watched, self._lifeline = self._context.Pipe(duplex=False)
         self._idle = [self._executor() for _ in range(count)]
         self._busy: dict[Future[str | None], ProcessPoolExecutor] = {}
+
+    def state(self) -> str:
+        """What goes on."""
+        return "generating"
 
     def room(self) -> int:
         """How many processes have nothing to do."""
@@ -152,11 +160,16 @@ class ClusterWorkers:
                 " pip install 'depthba[distributed]'"
             ) from error
         self._address = address
+        # What befalls a connection is told in one line, not in tracebacks.
+        self._log = logging.getLogger("distributed.client")
+        self._level = self._log.level
+        self._log.setLevel(logging.CRITICAL + 1)
         try:
             self._client: Any = distributed.Client(
                 address, timeout=_CONNECT, set_as_default=False, name="depthba"
             )
         except (OSError, ValueError, TypeError) as error:
+            self._log.setLevel(self._level)
             reason = " ".join(str(error).split())
             raise OptionError(
                 f"scheduler {address!r}: {reason}; expected the address of a Dask scheduler,"
@@ -166,10 +179,13 @@ class ClusterWorkers:
         self._executor = self._client.get_executor(pure=False)
         self._running = 0
 
+    def state(self) -> str:
+        """What goes on, or that nobody is there to do it."""
+        return "generating" if self._threads() else "waiting for workers"
+
     def room(self) -> int:
         """Enough to keep every worker busy, also one that has just come."""
-        threads = sum(self._asked(self._client.nthreads).values())
-        return max(2 * threads, 8) - self._running
+        return max(2 * self._threads(), 8) - self._running
 
     def submit(self, work: Work, *arguments: object) -> Future[str | None]:
         """Hand over one piece of work."""
@@ -192,6 +208,10 @@ class ClusterWorkers:
         with contextlib.suppress(Exception):
             self._executor.shutdown(wait=False)
         self._client.close()
+        self._log.setLevel(self._level)
+
+    def _threads(self) -> int:
+        return sum(self._asked(self._client.nthreads).values())
 
     def _asked(self, question: Callable[..., Any], *arguments: object) -> Any:
         try:
