@@ -190,21 +190,6 @@ class Plot:
         self.bench, self.half, self.at, self.gap, self.height = bench, half, at, gap, height
         self._taken = np.empty((0, len(_FEW)))
 
-    def put(self, piece: Piece, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Pose:
-        """Stand a piece at a place of this plot, unchecked; returns its pose in the world."""
-        ways = np.einsum("ij,ni->nj", about(2, yaw)[:2, :2], _FEW)
-        reach = [
-            np.einsum("di,ni->dn", ways, hull).max(axis=1) + np.einsum("di,i->d", _FEW, [x, y])
-            for hull in _footprint(piece)
-        ]
-        return self._stand(piece, np.stack(reach), Pose(x, y, z, yaw))
-
-    def _stand(self, piece: Piece, support: Array, where: Pose) -> Pose:
-        self._taken = np.concatenate([self._taken, support])
-        pose = self.at.at(where)
-        self.bench.add(piece, pose)
-        return pose
-
     def scatter(self, rng: np.random.Generator, piece: Piece, tries: int = 300) -> Pose | None:
         """Stand a piece at a random free place, with any heading; returns its pose in the world.
 
@@ -223,8 +208,10 @@ class Plot:
             if len(free):
                 k = int(free[0])
                 yaw = 2.0 * np.pi * float(shift[k]) / _FINE
-                place = Pose(float(at[k, 0]), float(at[k, 1]), yaw=yaw)
-                return self._stand(piece, support[k], place)
+                pose = self.at.at(Pose(float(at[k, 0]), float(at[k, 1]), yaw=yaw))
+                self._taken = np.concatenate([self._taken, support[k]])
+                self.bench.add(piece, pose)
+                return pose
         return None
 
     def _inside(self, support: Array) -> NDArray[np.bool_]:

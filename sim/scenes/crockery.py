@@ -38,7 +38,9 @@ def mug(rng: np.random.Generator) -> Piece:
     """A mug with a handle."""
     r, tall = rng.uniform(0.038, 0.046), rng.uniform(0.085, 0.105)
     waist = r * rng.uniform(0.86, 1.04)
-    side = curve([(r - 0.006, 0.0), (r - 0.001, 0.0), (r, 0.012), (waist, 0.5 * tall), (r, tall)])
+    side = curve(
+        [(r - 0.006, 0.0), (r - 0.001, 0.0), (r, 0.012), (waist, 0.5 * tall), (r, tall)], 0.006
+    )
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 41)
     reach, high = rng.uniform(0.026, 0.034), rng.uniform(0.024, 0.03)
     path = np.column_stack(
@@ -55,7 +57,7 @@ def bowl_shape(rng: np.random.Generator) -> tuple[Piece, float]:
     """A bowl, and its inner radius, m."""
     r, tall = rng.uniform(0.112, 0.125), rng.uniform(0.055, 0.07)
     side = curve([(0.4 * r, 0.0), (0.46 * r, 0.0), (0.46 * r, 0.006), (0.75 * r, 0.008),
-                  (0.98 * r, 0.55 * tall), (r, tall)])  # fmt: skip
+                  (0.98 * r, 0.55 * tall), (r, tall)], 0.006)  # fmt: skip
     solid = vessel(side, 0.005, 0.0105, 128)
     return Piece("bowl", (Part(solid, pick(rng, GLAZES), "glazed"),)), r - 0.005
 
@@ -68,7 +70,9 @@ def bowl(rng: np.random.Generator) -> Piece:
 def dish(rng: np.random.Generator) -> Piece:
     """A shallow dish with a fluted rim."""
     r = rng.uniform(0.07, 0.09)
-    side = curve([(0.5 * r, 0.0), (0.56 * r, 0.0), (0.6 * r, 0.004), (0.75 * r, 0.008), (r, 0.028)])
+    side = curve(
+        [(0.5 * r, 0.0), (0.56 * r, 0.0), (0.6 * r, 0.004), (0.75 * r, 0.008), (r, 0.028)], 0.006
+    )
     solid = vessel(side, 0.0045, 0.006, 128)
     waves = int(rng.integers(10, 17))
 

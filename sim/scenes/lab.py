@@ -94,7 +94,7 @@ def lab_2(seed: int) -> mujoco.MjSpec:
     for piece in sorted(pieces, key=_spread, reverse=True):
         plot.scatter(rng, piece)
     small = [maker(rng) for maker in (pebble, pebble, pebble, pebble, potato, lemon)]
-    for k in range(15):
+    for k in range(13):
         plot.scatter(rng, small[k % len(small)])
     return spec
 

@@ -17,6 +17,7 @@ from sim.scenes.crockery import vessel
 from sim.scenes.machined import ANODISED, STEEL, bolt_shape, bracket, nut
 from sim.scenes.solids import (
     UPRIGHT,
+    about,
     arc,
     circle,
     curve,
@@ -76,7 +77,7 @@ def tube_rack(rng: np.random.Generator) -> Panel:
     columns, rows = 7, 7
     places = _grid(columns, rows, pitch)
     a, b = 0.5 * columns * pitch + 0.004, 0.5 * rows * pitch + 0.004
-    holes = [circle(r + 0.0012, place, 96) for place in places]
+    holes = [circle(r + 0.0012, place, 64) for place in places]
     side = rectangle(0.5 * wall, b)
     rack = [
         extrude(rectangle(a, b), wall),
@@ -86,11 +87,11 @@ def tube_rack(rng: np.random.Generator) -> Panel:
             for s in (-1, 1)
         ),
     ]
-    bottom = arc((0.0, r), r, -0.5 * np.pi, 0.0, 12)
+    bottom = arc((0.0, r), r, -0.5 * np.pi, 0.0, 10)
     bottom[0, 0] = 0.0
     rim = [[r, tall - 0.002], [r + 0.0006, tall - 0.001], [r + 0.0006, tall], [r - 0.001, tall]]
     bore = [[r - 0.001, 0.7 * tall], [0.0, 0.7 * tall]]
-    tube = revolve(np.concatenate([bottom, rim, bore]), 64)
+    tube = revolve(np.concatenate([bottom, rim, bore]), 56)
     colour = pick(rng, _PAINTS)
     return [
         (Piece("rack", (Part(joined(rack), colour, "plastic"),)), Pose(0.0, 0.0)),
@@ -111,12 +112,13 @@ def cubes(rng: np.random.Generator) -> Panel:
 
 def nut_board(rng: np.random.Generator) -> Panel:
     """Nuts lying on a pegboard, each over a hole."""
-    pitch, size = 0.026, 0.016
+    pitch, size = 0.026, 0.014
     holes = [circle(0.003, place, 48) for place in _grid(9, 9, pitch)]
     solid = extrude(rounded(0.13, 0.13, 0.006), 0.008, holes)
     board = Piece("pegboard", (Part(solid, (0.24, 0.15, 0.08), "wood"),))
-    rows = _set_out(rng, nut(size), _grid(9, 5, pitch) * [1.0, 2.0], 0.008)
     # They were laid flat to flat, row by row.
+    turned = nut(size).moved((0.0, 0.0, 0.0), about(2, np.pi / 6.0))
+    rows = _set_out(rng, turned, _grid(9, 5, pitch) * [1.0, 2.0], 0.008)
     return [(board, Pose(0.0, 0.0)), *rows]
 
 
@@ -164,7 +166,7 @@ def jars(rng: np.random.Generator) -> Panel:
     r, tall = 0.41 * pitch, rng.uniform(0.05, 0.085)
     side = curve([(0.85 * r, 0.0), (r, 0.0), (r, 0.01), (r, 0.5 * tall), (r, 0.8 * tall),
                   (0.7 * r, 0.86 * tall), (0.7 * r, tall)], 0.006)  # fmt: skip
-    solid = vessel(side, 0.003, 0.004, 80)
+    solid = vessel(side, 0.003, 0.004, 72)
     colour = pick(rng, ((0.38, 0.37, 0.35), (0.06, 0.12, 0.22), (0.12, 0.21, 0.16)))
     piece = Piece("jar", (Part(solid, colour, "glazed"),))
     return _set_out(rng, piece, _grid(count, count, pitch))

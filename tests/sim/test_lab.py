@@ -59,6 +59,14 @@ class Built:
         return Solid(self.triangles.vertices[corners], index.reshape(-1, 3))
 
     @cached_property
+    def samples(self) -> dict[str, np.ndarray]:
+        """Points (n, 3) of each object's surface: the corners and the middles of its triangles."""
+        return {
+            name: np.concatenate([solid.vertices, solid.vertices[solid.faces].mean(axis=1)])
+            for name, solid in self.objects.items()
+        }
+
+    @cached_property
     def boxes(self) -> dict[str, np.ndarray]:
         """Lower and upper corner (2, 3) of each object."""
         return {
@@ -163,16 +171,18 @@ def test_nothing_sinks_into_anything(scene: Built) -> None:
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     for names in scene.groups:
         rays = scene.rays(names)
-        points = np.concatenate([
-            solid.vertices[scene.within(names, solid.vertices, 3)]
-            for other, solid in scene.objects.items() if other not in names
-        ])  # fmt: skip
+        every = np.concatenate(
+            [scene.samples[other] for other in scene.objects if other not in names]
+        )
+        points = every[scene.within(names, every, 3)]
+        if not len(points):
+            continue
         depth = np.full((len(points), 6), np.inf)
         for k, way in enumerate(ways):
             hits = rays.cast(points, np.broadcast_to(way, points.shape))
             leaves = (hits.triangle >= 0) & (rays.normals[hits.triangle] @ way > 0.0)
             depth[leaves, k] = hits.distance[leaves]
-        inside = np.isfinite(depth).sum(axis=1) >= 5
+        inside = np.isfinite(depth).all(axis=1)
         assert depth[inside].min(axis=1, initial=np.inf).max(initial=0.0) < SLACK, names
 
 
@@ -183,20 +193,25 @@ def test_nothing_floats(scene: Built) -> None:
         up = {name for name, z in lowest.items() if z > SLACK}
         if not up:
             continue
-        others = [name for name in scene.objects if name not in names]
+        low, high = np.stack([scene.boxes[name] for name in names], axis=1)
+        others = [
+            name for name, (a, b) in scene.boxes.items()
+            if name not in names and ((a <= high) & (b >= low))[:, :2].all(axis=1).any()
+        ]  # fmt: skip
         below = scene.rays(others)
         points = np.concatenate([scene.objects[name].vertices for name in others])
         for name in up:
             own = scene.objects[name].vertices
-            gap = below.cast(own, np.broadcast_to(down, own.shape)).distance
-            least = np.nanmin(gap, initial=lowest[name])
+            # From a hair above, so as not to start below what it touches.
+            gap = below.cast(own - SLACK * down, np.broadcast_to(down, own.shape)).distance
+            least = np.nanmin(gap, initial=lowest[name]) - SLACK
             if least > SLACK:
                 # Not by a corner of its own: by one of what is below.
                 near = points[scene.within([name], points, 2)]
                 mine = scene.rays([name])
-                hits = mine.cast(near, np.broadcast_to(-down, near.shape))
+                hits = mine.cast(near + SLACK * down, np.broadcast_to(-down, near.shape))
                 rises = (hits.triangle >= 0) & (mine.normals[hits.triangle, 2] < 0.0)
-                least = min(least, np.min(hits.distance[rises], initial=np.inf))
+                least = min(least, np.min(hits.distance[rises], initial=np.inf) - SLACK)
             assert least < SLACK, name
 
 
