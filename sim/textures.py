@@ -138,7 +138,9 @@ def coordinates(
     uniform = bool(model.mat_texuniform[material])
     corner = vertices[faces]
     if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
-        return corner / size if uniform else corner
+        if kind in (kinds.mjGEOM_MESH, kinds.mjGEOM_HFIELD):
+            return corner * size if uniform else corner
+        return corner if uniform or size[0] == 0.0 else corner / np.where(size > 0.0, size, 1.0)
     scale = model.mat_texrepeat[material] * (size[:2] if uniform else 1.0)
     uv = np.zeros(corner.shape)
     mesh = int(model.geom_dataid[geom])

@@ -84,7 +84,7 @@ def test_every_kind_of_geom_agrees_with_mujocos_own_rays() -> None:
         here = both & (geom == k)
         assert here.sum() > 200, f"geom {k} is hardly in sight"
         error = np.abs(hits.distance - depth)[here]
-        exact = model.geom_type[k] in (
+        exact = KINDS(int(model.geom_type[k])) in (
             KINDS.mjGEOM_PLANE, KINDS.mjGEOM_BOX, KINDS.mjGEOM_MESH, KINDS.mjGEOM_HFIELD
         )  # fmt: skip
         # Round shapes are polygons: at their rims a ray hardly touches them.

@@ -13,10 +13,13 @@ EVEN = Lighting(lamp=0.0, sky=1.0, ground=1.0)
 """The same light on every side: what is seen is the texture."""
 
 
-def textured(spec: mujoco.MjSpec, pixels: np.ndarray, **material: object) -> str:
-    """Add a 2D texture (height, width, 3) and a material of it; the material's name."""
+def textured(
+    spec: mujoco.MjSpec, pixels: np.ndarray, cube: bool = False, **material: object
+) -> str:
+    """Add a texture (height, width, 3) and a material of it; the material's name."""
+    kinds = mujoco.mjtTexture
     texture = spec.add_texture(
-        name="image", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3,
+        name="image", type=kinds.mjTEXTURE_CUBE if cube else kinds.mjTEXTURE_2D, nchannel=3,
         height=pixels.shape[0], width=pixels.shape[1],
     )  # fmt: skip
     texture.data = pixels.astype(np.uint8).tobytes()
