@@ -73,6 +73,13 @@ class Relief:
         above = self.z[r + 1, c] * (1.0 - u) + self.z[r + 1, c + 1] * u
         return np.asarray(below * (1.0 - v) + above * v)
 
+    def finer(self, x: float, y: float, radius: float, spacing: float) -> Relief:
+        """A copy of the square around (x, y) with another spacing, m."""
+        count = round(2.0 * radius / spacing) + 1
+        step = np.asarray(spacing * np.arange(count) - radius, np.float64)
+        z = self.at((x + step)[None, :], (y + step)[:, None])
+        return Relief(z, (x - radius, y - radius), spacing)
+
     def slope(self, x: float, y: float, reach: float) -> Array:
         """The gradient (2,) of the surface, taken over a distance `reach` m to either side."""
         h = self.at(np.array([x + reach, x - reach, x, x]), np.array([y, y, y + reach, y - reach]))
@@ -145,7 +152,7 @@ def rest_on_three(
     mean gap below it. Returns the rotation (3, 3) and the bottom's centre (3,).
     """
     cos, sin = np.cos(yaw), np.sin(yaw)
-    reach = [np.arange(-h, h + 1e-9, max(relief.spacing, h / 60.0)) for h in half]
+    reach = [np.arange(-h, h + 1e-9, max(relief.spacing, h / 150.0)) for h in half]
     u, v = (a.ravel() for a in np.meshgrid(*reach))
     px, py = x + cos * u - sin * v, y + sin * u + cos * v
     points = np.column_stack([u, v, relief.at(px, py)])

@@ -81,22 +81,27 @@ def settle(spec: mujoco.MjSpec, how: Settling = Settling()) -> mujoco.MjSpec:
         free = [rise < stone.height for rise, stone in zip(rises, stones, strict=True)]
         out = [stone.index for stone, falls in zip(stones, free, strict=True) if not falls]
         stones = [stone for stone, falls in zip(stones, free, strict=True) if falls]
-    lowest = float(relief.z.min()) - 1.0
+    lowest, fallen = float(relief.z.min()) - 1.0, []
     while stones or bodies:
         layer, stones = stones[: how.layer], stones[how.layer :]
         room = how.layer - len(layer)
         dropped, bodies = bodies[:room], bodies[room:]
-        work = still.copy()
-        _take_away(work, out + [stone.index for stone in stones], bodies)
-        _fall(still, work, relief, layer, dropped, how)
+        _lift(relief, layer, how)
+        absent = out + [stone.index for stone in stones]
+        _fall(still, layer, dropped, absent, bodies, how)
         out += [stone.index for stone in layer if stone.position[2] < lowest]
         for stone in layer:
             x, y, z = stone.position
             relief.raise_to(stone.planes, x, y, z, stone.radius)
+        fallen += layer
+    while covering := _in_sight(still, out, how):
+        out += covering
+        gone = [stone for stone in fallen if stone.index in covering]
+        fallen = [stone for stone in fallen if stone.index not in out]
+        _fall(still, [stone for stone in fallen if _near(stone, gone)], [], out, [], how)
     geoms = list(still.worldbody.geoms)
     for index in out:
         still.delete(geoms[index])
-    _clear_markers(still, how)
     return still
 
 
@@ -169,6 +174,23 @@ def _rise(relief: Relief, stone: _Stone) -> float:
     return relief.bed(stone.planes, x, y, stone.radius, sink=0.0, raising=False) - z
 
 
+def _lift(relief: Relief, stones: list[_Stone], how: Settling) -> None:
+    """Raise stones until they lie clear of the relief and of each other."""
+    pile = Relief(relief.z.copy(), relief.origin, relief.spacing)
+    for stone in stones:
+        x, y, _ = stone.position
+        z = pile.bed(stone.planes, x, y, stone.radius, sink=0.0) + how.clearance
+        stone.position = np.array([x, y, z])
+
+
+def _near(stone: _Stone, others: list[_Stone]) -> bool:
+    """Whether a stone may touch one of the others."""
+    return any(
+        np.linalg.norm(stone.position - other.position) < stone.radius + other.radius
+        for other in others
+    )
+
+
 def _take_away(spec: mujoco.MjSpec, geoms: list[int], bodies: list[int]) -> None:
     """Let nothing collide with these geoms and bodies of the world: quicker than deleting them."""
     world, roots = list(spec.worldbody.geoms), list(spec.worldbody.bodies)
@@ -178,22 +200,24 @@ def _take_away(spec: mujoco.MjSpec, geoms: list[int], bodies: list[int]) -> None
 
 def _fall(
     still: mujoco.MjSpec,
-    work: mujoco.MjSpec,
-    relief: Relief,
     stones: list[_Stone],
     bodies: list[int],
+    absent: list[int],
+    later: list[int],
     how: Settling,
 ) -> None:
-    """Let stones and bodies fall in `work`, and fix them in `still` where they end up."""
+    """Let stones and bodies fall from where they are, and fix them in `still` where they end up.
+
+    `absent` are the geoms of the world, `later` its bodies that they do not meet.
+    """
+    work = still.copy()
     geoms, roots = list(work.worldbody.geoms), list(work.worldbody.bodies)
     falling = [roots[k] for k in bodies]
     _lock(work, falling)
-    _take_away(work, [stone.index for stone in stones], [])
-    pile = Relief(relief.z.copy(), relief.origin, relief.spacing)
+    _take_away(work, absent + [stone.index for stone in stones], later)
     for stone in stones:
-        geom, (x, y, _) = geoms[stone.index], stone.position
-        z = pile.bed(stone.planes, x, y, stone.radius, sink=0.0) + how.clearance
-        body = work.worldbody.add_body(pos=[x, y, z], quat=geom.quat)
+        geom = geoms[stone.index]
+        body = work.worldbody.add_body(pos=stone.position, quat=geom.quat)
         body.add_freejoint()
         body.add_geom(
             type=geom.type, meshname=geom.meshname, size=geom.size, friction=how.friction, condim=6
@@ -245,30 +269,28 @@ def _lock(spec: mujoco.MjSpec, free: list[mujoco.MjsBody]) -> None:
         spec.delete(element)
 
 
-def _clear_markers(spec: mujoco.MjSpec, how: Settling) -> None:
-    """Take out the loose geoms between a marker's disc and whoever looks at it from above."""
+def _in_sight(spec: mujoco.MjSpec, out: list[int], how: Settling) -> list[int]:
+    """The loose geoms between a marker's disc and whoever looks at it from above.
+
+    `out` are geoms of the world that do not count.
+    """
     model, data = _compiled(spec)
+    geoms = list(spec.worldbody.geoms)
+    model.geom_group[[geoms[k].id for k in out]] = 5
+    loose = {g.id: k for k, g in enumerate(geoms) if g.name.startswith(LOOSE)}
     discs = discs_of(model, data)
+    if not discs or not loose:
+        return []
+    rays = RayScene.of_model(model, data, groups=(0, 1, 2, 3, 4))
     turn = 2.0 * np.pi * np.arange(48) / 48
     ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(48)])
-    up = np.array([0.0, 0.0, 1.0])
     lean = np.tan(how.in_sight) * np.linspace(0.0, 1.0, 6)
-    towards = np.concatenate([up + k * ring for k in lean])
-    loose = {geom.id: geom for geom in spec.worldbody.geoms if geom.name.startswith(LOOSE)}
-    away: list[int] = []
-    found = bool(loose)
-    while discs and found:
-        rays = RayScene.of_model(model, data, groups=(0, 1, 2, 3, 4))
-        met: set[int] = set()
-        for disc in discs:
-            rim = np.concatenate([ring[::4] * disc.radius, np.zeros((1, 3))])
-            start = disc.p_world + 1e-4 * disc.normal + rim[:, None]
-            fan = np.broadcast_to(towards, (len(rim), *towards.shape))
-            origins = np.broadcast_to(start, fan.shape)
-            met |= set(np.unique(rays.cast(origins, fan).geom).tolist())
-        covering = sorted(met & loose.keys() - set(away))
-        model.geom_group[covering] = 5
-        away += covering
-        found = bool(covering)
-    for number in away:
-        spec.delete(loose[number])
+    towards = np.concatenate([np.array([0.0, 0.0, 1.0]) + k * ring for k in lean])
+    met: set[int] = set()
+    for disc in discs:
+        rim = np.concatenate([ring[::4] * disc.radius, np.zeros((1, 3))])
+        start = disc.p_world + 1e-4 * disc.normal + rim[:, None]
+        fan = np.broadcast_to(towards, (len(rim), *towards.shape))
+        found = rays.cast(np.broadcast_to(start, fan.shape), fan).geom
+        met |= set(np.unique(found).tolist())
+    return [loose[number] for number in sorted(met & loose.keys())]

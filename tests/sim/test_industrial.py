@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sim
 from depthba.dataset import Dataset, verify
 from depthba.se3 import inverse
 from sim.engine import mujoco
@@ -27,8 +28,10 @@ def test_the_writer_made_a_faultless_dataset(clean_bay: Path, noisy_bay: Path) -
         dataset = Dataset.open(path)
         assert len(dataset) == 21 and dataset.warnings == () and dataset.map_frame == "world"
         assert "created" not in dataset.header
-        assert all(np.isfinite(frame.depth()).mean() > 0.999 for frame in dataset)
-    assert Dataset.open(clean_bay).pose_noise is None
+    clean, noisy = Dataset.open(clean_bay), Dataset.open(noisy_bay)
+    assert all(np.isfinite(frame.depth()).mean() > 0.999 for frame in clean)
+    assert all(np.isfinite(frame.depth()).mean() > 0.9 for frame in noisy)  # shadows, dropouts
+    assert clean.pose_noise is None
 
 
 def test_the_truth_is_exact(clean_bay: Path, bay_model: mujoco.MjModel) -> None:
@@ -82,6 +85,22 @@ def test_depth_noise_is_what_the_header_says(clean_bay: Path, noisy_bay: Path) -
     clean, noisy = Dataset.open(clean_bay), Dataset.open(noisy_bay)
     noise = noisy.sensor.noise
     assert clean.sensor.noise is None and noise is not None
+    assert (noise.sigma_m, noise.at_m, noise.power, noise.along) == (0.00032, 3.0, 2.0, "z")
+    z = np.array([frame.depth() for frame in clean], float)
+    score = (np.array([frame.depth() for frame in noisy], float) - z) / noise.sigma(z)
+    score = np.abs(score[np.isfinite(score)])
+    assert 1.4826 * np.median(score) == pytest.approx(1.0, abs=0.05)
+    assert np.percentile(score, 99) == pytest.approx(2.58, abs=0.2)  # few fly or graze
+
+
+def test_white_noise_is_white(clean_bay: Path, tmp_path: Path) -> None:
+    options = sim.GenerateOptions(seed=3, size=(320, 240), white=True, rgb=False)
+    clean, noisy = (
+        Dataset.open(clean_bay),
+        Dataset.open(sim.generate("industrial-6", tmp_path / "white", options)),
+    )
+    noise = noisy.sensor.noise
+    assert noise is not None
     assert (noise.sigma_m, noise.at_m, noise.power, noise.along) == (0.00032, 3.0, 2.0, "range")
     camera = SP1000.resized(320, 240).camera
     stretch = np.linalg.norm(camera.rays(), axis=-1)
