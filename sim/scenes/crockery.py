@@ -43,12 +43,11 @@ def mug(rng: np.random.Generator) -> Piece:
     )
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 41)
     reach, high = rng.uniform(0.026, 0.034), rng.uniform(0.024, 0.03)
-    path = np.column_stack(
-        [min(r, waist) - 0.0015 + reach * np.cos(angle) ** 0.8, np.zeros(41),
-         0.52 * tall + high * np.sin(angle)]
-    )  # fmt: skip
+    z = 0.52 * tall + high * np.sin(angle)
+    # Both ends stop within the wall.
+    x = np.interp(z, side[:, 1], side[:, 0]) - 0.0022 + reach * np.cos(angle) ** 0.8
+    path = np.column_stack([x, np.zeros(41), z])
     handle = tube(path, 0.0052, 40, flat=1.35)
-    # Its ends would look out inside the mug: they stop within the wall.
     body = vessel(side, 0.0045, 0.005, 96)
     return Piece("mug", (Part(joined([body, handle]), pick(rng, GLAZES), "glazed"),))
 

@@ -127,7 +127,7 @@ def egg_tray(rng: np.random.Generator) -> Panel:
     pitch, columns, rows = 0.047, 5, 5
     half_x, half_y = 0.5 * columns * pitch, 0.5 * rows * pitch
     y, x = np.meshgrid(
-        np.linspace(-half_y, half_y, 20 * rows + 1), np.linspace(-half_x, half_x, 20 * columns + 1),
+        np.linspace(-half_y, half_y, 18 * rows + 1), np.linspace(-half_x, half_x, 18 * columns + 1),
         indexing="ij",
     )  # fmt: skip
     wave = 2.0 * np.pi / pitch
@@ -141,7 +141,7 @@ def egg_tray(rng: np.random.Generator) -> Panel:
     egg_profile = np.column_stack([r * np.cos(angle) * taper, 1.32 * r * (1.0 + np.sin(angle))])
     egg_profile[[0, -1], 0] = 0.0
     colour = pick(rng, ((0.40, 0.27, 0.18), (0.43, 0.41, 0.37)))
-    egg = Piece("egg", (Part(revolve(egg_profile, 56), colour, "plastic"),))
+    egg = Piece("egg", (Part(revolve(egg_profile, 52), colour, "plastic"),))
     carton = Piece("egg_tray", (Part(tray, (0.22, 0.215, 0.20), "matt"),))
     # An egg finds the middle of its pocket, and all pockets are alike.
     z = 0.1 - drop(egg.moved((0.0, 0.0, 0.1)), [tray])
@@ -166,7 +166,7 @@ def jars(rng: np.random.Generator) -> Panel:
     r, tall = 0.41 * pitch, rng.uniform(0.05, 0.085)
     side = curve([(0.85 * r, 0.0), (r, 0.0), (r, 0.01), (r, 0.5 * tall), (r, 0.8 * tall),
                   (0.7 * r, 0.86 * tall), (0.7 * r, tall)], 0.006)  # fmt: skip
-    solid = vessel(side, 0.003, 0.004, 72)
+    solid = vessel(side, 0.003, 0.004, 64)
     colour = pick(rng, ((0.38, 0.37, 0.35), (0.06, 0.12, 0.22), (0.12, 0.21, 0.16)))
     piece = Piece("jar", (Part(solid, colour, "glazed"),))
     return _set_out(rng, piece, _grid(count, count, pitch))
