@@ -159,13 +159,14 @@ class Board:
             grid = np.full((self.rows, self.columns, 2), np.nan)
             grid.reshape(-1, 2)[ids] = found.reshape(-1, 2)
             return ids, _refined(self._without_markers(grey, markers), grid)[ids]
-        size = (self.columns, self.rows)
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-        seen, found = cv2.findChessboardCornersSB(grey, size, flags=flags)
-        if not seen:
-            return np.zeros(0, np.int64), np.zeros((0, 2))
-        grid = np.asarray(found, float).reshape(self.rows, self.columns, 2)
-        return np.arange(len(found)), _refined(grey, _as_printed(grey, grid))
+        size, thorough = (self.columns, self.rows), cv2.CALIB_CB_EXHAUSTIVE
+        # Stretching the contrast finds some boards and loses others.
+        for flags in (thorough, thorough | cv2.CALIB_CB_NORMALIZE_IMAGE):
+            seen, found = cv2.findChessboardCornersSB(grey, size, flags=flags)
+            if seen:
+                grid = np.asarray(found, float).reshape(self.rows, self.columns, 2)
+                return np.arange(len(found)), _refined(grey, _as_printed(grey, grid))
+        return np.zeros(0, np.int64), np.zeros((0, 2))
 
     @cached_property
     def _charuco(self) -> Any:
@@ -179,7 +180,10 @@ class Board:
     def _detector(self) -> Any:
         import cv2
 
-        return cv2.aruco.CharucoDetector(self._charuco)
+        parameters = cv2.aruco.DetectorParameters()
+        # With fewer a marker that is seen at a slant is misread now and then.
+        parameters.perspectiveRemovePixelPerCell = 8
+        return cv2.aruco.CharucoDetector(self._charuco, cv2.aruco.CharucoParameters(), parameters)
 
     def _without_markers(self, grey: Image, markers: Any) -> Image:
         """The image with the markers painted over in their squares' white: a checkerboard."""

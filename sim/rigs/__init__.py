@@ -38,6 +38,7 @@ class Rig(Protocol):
 
 RIGS: dict[str, str] = {
     "arm": "sim.rigs.arm:Arm",
+    "board-arm": "sim.rigs.board_arm:BoardArm",
     "dome": "sim.rigs.dome:Dome",
     "gantry": "sim.rigs.gantry:Gantry",
 }
