@@ -88,13 +88,20 @@ class Relief:
     def window(self, x: float, y: float, radius: float) -> tuple[tuple[slice, slice], Array, Array]:
         """The nodes within a square around (x, y): slices into z, and their offsets dx, dy."""
         rows, columns = self.z.shape
-        c0 = max(int(np.floor((x - radius - self.origin[0]) / self.spacing)), 0)
-        c1 = min(int(np.ceil((x + radius - self.origin[0]) / self.spacing)) + 1, columns)
-        r0 = max(int(np.floor((y - radius - self.origin[1]) / self.spacing)), 0)
-        r1 = min(int(np.ceil((y + radius - self.origin[1]) / self.spacing)) + 1, rows)
-        dx = self.origin[0] + self.spacing * np.arange(c0, max(c0, c1)) - x
-        dy = self.origin[1] + self.spacing * np.arange(r0, max(r0, r1)) - y
+        reach = np.array([-radius, radius])
+        c0, c1 = self._nodes(x + reach - self.origin[0], columns)
+        r0, r1 = self._nodes(y + reach - self.origin[1], rows)
+        dx = np.asarray(self.origin[0] + self.spacing * np.arange(c0, c1) - x, np.float64)
+        dy = np.asarray(self.origin[1] + self.spacing * np.arange(r0, r1) - y, np.float64)
         return (slice(r0, r1), slice(c0, c1)), dx[None, :], dy[:, None]
+
+    def _nodes(self, span: Array, count: int) -> tuple[int, int]:
+        """The first of the nodes around a span (2,) m, and the one after the last."""
+        first, last = span / self.spacing
+        return (
+            min(max(int(np.floor(first)), 0), count),
+            min(max(int(np.ceil(last)) + 1, 0), count),
+        )
 
     def raise_to(self, planes: Array, x: float, y: float, z: float, radius: float) -> None:
         """Lift the surface to the top of a convex body standing at (x, y, z)."""
