@@ -189,7 +189,7 @@ _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS, _TRIANGLE, _GEOMETR
 
 
 @nb.njit(cache=True, nogil=True)
-def new_packet():
+def _new_packet():
     """Two views of one packet, as floats and as integers (rows, 16), and its mask (1, 16)."""
     room = np.zeros((_ROWS + 2) * LANES, np.float32)
     skip = (-room.ctypes.data % 64) // 4  # Embree wants it aligned
@@ -198,7 +198,7 @@ def new_packet():
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def intersect(handle, floats, ints, valid):
+def _intersect(handle, floats, ints, valid):
     """Find the first hits of the packet's valid rays: `ints[17]`, with -1 in `ints[18]` for none.
 
     Origin and direction must be set (rows 0-2 and 4-6).
@@ -215,7 +215,7 @@ def intersect(handle, floats, ints, valid):
 
 @nb.njit(cache=True, nogil=True)
 def _first(handle, origins, directions, found):
-    floats, ints, valid = new_packet()
+    floats, ints, valid = _new_packet()
     one = 0 if len(origins) == 1 else 1
     for begin in range(0, len(directions), LANES):
         for lane in range(LANES):
@@ -225,14 +225,14 @@ def _first(handle, origins, directions, found):
                 for c in range(3):
                     floats[_ORIGIN + c, lane] = origins[i * one, c]
                     floats[_DIRECTION + c, lane] = directions[i, c]
-        intersect(handle, floats, ints, valid)
+        _intersect(handle, floats, ints, valid)
         for lane in range(min(LANES, len(directions) - begin)):
             found[begin + lane] = ints[_TRIANGLE, lane] if ints[_GEOMETRY, lane] >= 0 else -1
 
 
 @nb.njit(cache=True, nogil=True)
 def _blocked(handle, origins, directions, reach, found):
-    floats, ints, valid = new_packet()
+    floats, ints, valid = _new_packet()
     one = 0 if len(origins) == 1 else 1
     each = 0 if len(directions) == 1 else 1
     limit = 0 if len(reach) == 1 else 1
@@ -253,3 +253,62 @@ def _blocked(handle, origins, directions, reach, found):
         _call(handle[3], valid.ctypes.data, handle[0], floats.ctypes.data, handle[1])
         for lane in range(min(LANES, len(found) - begin)):
             found[begin + lane] = valid[0, lane] != 0 and floats[_FAR, lane] < 0.0
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _along(plane, k, ox, oy, oz, dx, dy, dz):
+    """Distance to a triangle's plane along a ray; NaN where they are parallel."""
+    n = plane[k]
+    towards = n[0] * dx + n[1] * dy + n[2] * dz
+    if towards == 0.0:
+        return np.nan
+    return (n[3] - n[0] * ox - n[1] * oy - n[2] * oz) / towards
+
+
+@nb.njit(cache=True, nogil=True)
+def measure(found, origins, directions, plane, owner, distance, triangle, geom):
+    """Fill distance, triangle and geom of rays (n,) that found these triangles."""
+    one = 0 if len(origins) == 1 else 1
+    for i in range(len(found)):
+        k = found[i]
+        o, d = origins[i * one], directions[i]
+        distance[i] = _along(plane, k, o[0], o[1], o[2], d[0], d[1], d[2]) if k >= 0 else np.nan
+        seen = k >= 0 and not np.isnan(distance[i])
+        triangle[i] = k if seen else -1
+        geom[i] = owner[k] if seen else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def view(handle, rays, T, plane, owner, distance, triangle, geom):
+    """Fill distance, triangle and geom (height, width) of a camera's rays, by squares of 4 x 4."""
+    floats, ints, valid = _new_packet()
+    directions = np.empty((LANES, 3))
+    height, width = distance.shape
+    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
+    floats[_ORIGIN], floats[_ORIGIN + 1], floats[_ORIGIN + 2] = ox, oy, oz
+    for top in range(0, height, 4):
+        for left in range(0, width, 4):
+            for lane in range(LANES):
+                y, x = top + lane // 4, left + lane % 4
+                valid[0, lane] = 0
+                if y < height and x < width:
+                    a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
+                    valid[0, lane] = -1 if np.isfinite(a + b + c) else 0
+                    for r in range(3):
+                        d = T[r, 0] * a + T[r, 1] * b + T[r, 2] * c
+                        directions[lane, r] = d
+                        floats[_DIRECTION + r, lane] = d
+            _intersect(handle, floats, ints, valid)
+            for lane in range(LANES):
+                y, x = top + lane // 4, left + lane % 4
+                if y >= height or x >= width:
+                    continue
+                k = ints[_TRIANGLE, lane] if ints[_GEOMETRY, lane] >= 0 else -1
+                t = np.nan
+                if k >= 0:
+                    d = directions[lane]
+                    t = _along(plane, k, ox, oy, oz, d[0], d[1], d[2])
+                seen = not np.isnan(t)
+                distance[y, x] = t
+                triangle[y, x] = k if seen else -1
+                geom[y, x] = owner[k] if seen else -1

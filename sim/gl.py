@@ -202,9 +202,7 @@ class GlRenderer:
 
     def _aim(self, camera: Camera, T: Array) -> None:
         """Put the eye at T_world_camera, its frustum through the outer rims of the pixels."""
-        left, right = (
-            (u - camera.cx) / camera.fx * self._near for u in (-0.5, camera.width - 0.5)
-        )
+        left, right = ((u - camera.cx) / camera.fx * self._near for u in (-0.5, camera.width - 0.5))
         top, bottom = (
             (camera.cy - v) / camera.fy * self._near for v in (-0.5, camera.height - 0.5)
         )

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from depthba.camera import Camera
 from sim import embree
 from sim.engine import mujoco
-from sim.tessellate import SEGMENTS, Triangles, triangles_of
+from sim.errors import SimulationError
+from sim.tessellate import SEGMENTS, Shapes, Triangles
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ class RayScene:
     def __init__(self, triangles: Triangles) -> None:
         """Build the acceleration structure; MissingPackage if embreex is not there."""
         self.triangles = triangles
+        self._shapes: Shapes | None = None
         self._plane = np.empty((len(triangles.faces), 4))
         _planes(triangles.vertices, triangles.faces, self._plane)
         self._embree = embree.build(
@@ -68,7 +70,21 @@ class RayScene:
         if data is None:
             data = mujoco.MjData(model)
             mujoco.mj_kinematics(model, data)
-        return cls(triangles_of(model, data, groups, segments))
+        shapes = Shapes(model, groups, segments)
+        scene = cls(shapes.at(data))
+        scene._shapes = shapes
+        return scene
+
+    def at(self, data: mujoco.MjData) -> RayScene:
+        """The same model at another pose, quicker than `of_model`; only for a scene made by that.
+
+        `data` must hold the forward kinematics.
+        """
+        if self._shapes is None:
+            raise SimulationError("a scene of bare triangles has no joints to move")
+        scene = type(self)(self._shapes.at(data))
+        scene._shapes = self._shapes
+        return scene
 
     def cast(self, origins: Array, directions: Array) -> Hits:
         """Shoot rays from origins (3,) or (..., 3) along directions (..., 3), world frame, m.
@@ -82,7 +98,7 @@ class RayScene:
             o = np.broadcast_to(o, directions.shape).reshape(-1, 3)
         found = self._embree.first(o.astype(np.float32), d.astype(np.float32))
         hits = _nothing(len(d))
-        _measure(found, o, d, self._plane, self.triangles.geom, *hits)
+        embree.measure(found, o, d, self._plane, self.triangles.geom, *hits)
         distance, triangle, geom = hits
         return Hits(distance.reshape(shape), triangle.reshape(shape), geom.reshape(shape))
 
@@ -92,7 +108,7 @@ class RayScene:
             return self.cast(T_world_camera[:3, 3], world_rays(camera, T_world_camera))
         hits = _nothing((camera.height, camera.width))
         T = np.ascontiguousarray(T_world_camera, float)
-        _view(self._embree.handle, camera.rays(), T, self._plane, self.triangles.geom, *hits)
+        embree.view(self._embree.handle, camera.rays(), T, self._plane, self.triangles.geom, *hits)
         return Hits(*hits)
 
     def incidence(self, camera: Camera, T_world_camera: Array, hits: Hits) -> Array:
@@ -166,65 +182,6 @@ def _planes(vertices, faces, plane):
         scale = 1.0 / length if length > 0.0 else 0.0
         plane[k, 0], plane[k, 1], plane[k, 2] = x * scale, y * scale, z * scale
         plane[k, 3] = (x * a[0] + y * a[1] + z * a[2]) * scale
-
-
-@nb.njit(cache=True, nogil=True, inline="always")
-def _along(plane, k, ox, oy, oz, dx, dy, dz):
-    """Distance to a triangle's plane along a ray; NaN where they are parallel."""
-    n = plane[k]
-    towards = n[0] * dx + n[1] * dy + n[2] * dz
-    if towards == 0.0:
-        return np.nan
-    return (n[3] - n[0] * ox - n[1] * oy - n[2] * oz) / towards
-
-
-@nb.njit(cache=True, nogil=True)
-def _measure(found, origins, directions, plane, owner, distance, triangle, geom):
-    """Fill distance, triangle and geom of rays (n,) that found these triangles."""
-    one = 0 if len(origins) == 1 else 1
-    for i in range(len(found)):
-        k = found[i]
-        o, d = origins[i * one], directions[i]
-        distance[i] = _along(plane, k, o[0], o[1], o[2], d[0], d[1], d[2]) if k >= 0 else np.nan
-        seen = k >= 0 and not np.isnan(distance[i])
-        triangle[i] = k if seen else -1
-        geom[i] = owner[k] if seen else -1
-
-
-@nb.njit(cache=True, nogil=True)
-def _view(handle, rays, T, plane, owner, distance, triangle, geom):
-    """Fill distance, triangle and geom (height, width) of a camera's rays, by squares of 4 x 4."""
-    floats, ints, valid = embree.new_packet()
-    directions = np.empty((embree.LANES, 3))
-    height, width = distance.shape
-    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
-    floats[0], floats[1], floats[2] = ox, oy, oz
-    for top in range(0, height, 4):
-        for left in range(0, width, 4):
-            for lane in range(embree.LANES):
-                y, x = top + lane // 4, left + lane % 4
-                valid[0, lane] = 0
-                if y < height and x < width:
-                    a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
-                    valid[0, lane] = -1 if np.isfinite(a + b + c) else 0
-                    for r in range(3):
-                        d = T[r, 0] * a + T[r, 1] * b + T[r, 2] * c
-                        directions[lane, r] = d
-                        floats[4 + r, lane] = d
-            embree.intersect(handle, floats, ints, valid)
-            for lane in range(embree.LANES):
-                y, x = top + lane // 4, left + lane % 4
-                if y >= height or x >= width:
-                    continue
-                k = ints[17, lane] if ints[18, lane] >= 0 else -1
-                t = np.nan
-                if k >= 0:
-                    d = directions[lane]
-                    t = _along(plane, k, ox, oy, oz, d[0], d[1], d[2])
-                seen = not np.isnan(t)
-                distance[y, x] = t
-                triangle[y, x] = k if seen else -1
-                geom[y, x] = owner[k] if seen else -1
 
 
 @nb.njit(cache=True, nogil=True)

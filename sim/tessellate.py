@@ -13,15 +13,25 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.creases import crease
 from sim.engine import mujoco
 from sim.errors import SimulationError
 from sim.textures import coordinates
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Floats = NDArray[np.float32]
 Mesh = tuple[Array, Indices]
+Shape = tuple[Array, Indices, Indices, Floats]
+"""Vertices, faces, the curved ones among these, and their corners' normals."""
 
 SEGMENTS = 256
+
+UNSET = (0.5, 0.5, 0.5, 1.0)
+"""The colour of a geom that was given none; then its material's counts."""
+
+CREASE = np.radians(20.0)
+"""Faces that meet at less than this angle stand for one curved surface."""
 
 PLANE_REACH = 50.0
 """Half length at which an infinite plane is cut off, m."""
@@ -41,6 +51,69 @@ class Triangles:
     """(k,) the faces that have a texture."""
     texcoord: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     """(k, 3, 3) their corners' texture coordinates: u, v, 0; a direction into a cube texture."""
+    curved: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(j,) the faces that stand for a curved surface."""
+    corner_normals: Floats = field(default_factory=lambda: np.zeros((0, 3, 3), np.float32))
+    """(j, 3, 3) that surface's outward normals at their corners."""
+
+
+class Shapes:
+    """The shapes of a model's visible geoms, each in its own frame: what no pose changes."""
+
+    def __init__(
+        self, model: mujoco.MjModel, groups: tuple[int, ...] = (0, 1, 2), segments: int = SEGMENTS
+    ) -> None:
+        """Cut up the geoms with alpha above 0 of these groups.
+
+        SimulationError names a geom that has no triangles, or says that none is visible.
+        """
+        known: dict[tuple[object, ...], Shape] = {}
+        self._placed: list[tuple[int, Shape]] = []
+        textured, texcoord, first = [np.zeros(0, np.int64)], [np.zeros((0, 3, 3))], 0
+        curved, faces = [np.zeros(0, np.int64)], []
+        vertices = 0
+        for geom in range(model.ngeom):
+            if model.geom_group[geom] not in groups or _alpha(model, geom) == 0.0:
+                continue
+            kind, data = int(model.geom_type[geom]), int(model.geom_dataid[geom])
+            key = (kind, data, *model.geom_size[geom])
+            if key not in known:
+                known[key] = _rounded(*_shape(model, geom, segments), kind)
+            v, f, bent, _ = known[key]
+            self._placed.append((geom, known[key]))
+            laid = coordinates(model, geom, v, f)
+            if laid is not None:
+                textured.append(np.arange(first, first + len(f)))
+                texcoord.append(laid)
+            curved.append(bent + first)
+            faces.append(f + vertices)
+            first += len(f)
+            vertices += len(v)
+        if not self._placed:
+            raise SimulationError("the scene has no visible geom")
+        self._faces = np.concatenate(faces)
+        self._geom = np.repeat(
+            [geom for geom, _ in self._placed], [len(shape[1]) for _, shape in self._placed]
+        )
+        self._curved = np.concatenate(curved)
+        self._textured, self._texcoord = np.concatenate(textured), np.concatenate(texcoord)
+
+    def at(self, data: mujoco.MjData) -> Triangles:
+        """Their triangles at the pose in `data`, which must hold the forward kinematics."""
+        vertices, normals = [], []
+        for geom, (v, _, _, bend) in self._placed:
+            R = data.geom_xmat[geom].reshape(3, 3)
+            vertices.append(np.einsum("ni,ji->nj", v, R) + data.geom_xpos[geom])
+            normals.append(np.einsum("kci,ji->kcj", bend, R.astype(np.float32)))
+        return Triangles(
+            np.concatenate(vertices),
+            self._faces,
+            self._geom,
+            self._textured,
+            self._texcoord,
+            self._curved,
+            np.concatenate(normals),
+        )
 
 
 def triangles_of(
@@ -53,40 +126,21 @@ def triangles_of(
 
     `data` must hold the forward kinematics. SimulationError names a geom that has no triangles.
     """
-    local: dict[tuple[object, ...], Mesh] = {}
-    vertices, faces, owner = [], [], []
-    textured, texcoord = [np.zeros(0, np.int64)], [np.zeros((0, 3, 3))]
-    count = before = 0
-    for geom in range(model.ngeom):
-        if model.geom_group[geom] not in groups or _alpha(model, geom) == 0.0:
-            continue
-        key = (int(model.geom_type[geom]), int(model.geom_dataid[geom]), *model.geom_size[geom])
-        if key not in local:
-            local[key] = _shape(model, geom, segments)
-        v, f = local[key]
-        vertices.append(v @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
-        faces.append(f + count)
-        owner.append(np.full(len(f), geom))
-        laid = coordinates(model, geom, v, f)
-        if laid is not None:
-            textured.append(np.arange(before, before + len(f)))
-            texcoord.append(laid)
-        count += len(v)
-        before += len(f)
-    if not vertices:
-        raise SimulationError("the scene has no visible geom")
-    return Triangles(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        np.concatenate(owner),
-        np.concatenate(textured),
-        np.concatenate(texcoord),
-    )
+    return Shapes(model, groups, segments).at(data)
 
 
 def _alpha(model: mujoco.MjModel, geom: int) -> float:
-    material = int(model.geom_matid[geom])
-    return float(model.geom_rgba[geom, 3] if material < 0 else model.mat_rgba[material, 3])
+    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    return float(model.mat_rgba[material, 3] if material >= 0 and (own == UNSET).all() else own[3])
+
+
+def _rounded(vertices: Array, faces: Indices, kind: int) -> Shape:
+    """A shape with the normals of its curved faces; a height field has none, for speed."""
+    kinds = mujoco.mjtGeom
+    if kinds(kind) in (kinds.mjGEOM_PLANE, kinds.mjGEOM_BOX, kinds.mjGEOM_HFIELD):
+        return vertices, faces, np.zeros(0, np.int64), np.zeros((0, 3, 3), np.float32)
+    curved, normals = crease(vertices, faces, float(np.cos(CREASE)))
+    return vertices, faces, curved, normals
 
 
 def _shape(model: mujoco.MjModel, geom: int, segments: int) -> Mesh:

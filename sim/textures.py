@@ -1,17 +1,14 @@
 """Textures: where they lie on a geom, and what colour they have there.
 
 Coordinates follow MuJoCo's GL renderer: the first row of a texture's data is at v = 0, and
-`texrepeat` and `texuniform` scale them. Colours are looked up in linear light, averaged over the
-pixel's footprint: bilinear in a pyramid of halved images (Williams 1983), several times along
-the footprint's sides where it is long.
+`texrepeat` and `texuniform` scale them. Images are kept in linear light, as pyramids of halved
+images (Williams 1983).
 """
 
 from __future__ import annotations
 
-# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,11 +16,6 @@ from sim.engine import mujoco
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-TAPS = 8
-"""Most look-ups along each side of a pixel's footprint."""
-
-FACES = 6
 
 
 def texture_of(model: mujoco.MjModel, geom: int) -> int:
@@ -182,87 +174,3 @@ def _wrapped(kind: mujoco.mjtGeom, size: Array, corner: Array) -> Array:
         lid = np.ptp(corner[..., 2], axis=1) == 0.0
         uv[lid] = flat[lid, :, :2]
     return uv
-
-
-@nb.njit(cache=True, nogil=True, inline="always")
-def _bilinear(texels, start, height, width, u, v, wrap, colour):
-    """Add the colour at (u, v), in texels, to `colour`."""
-    x, y = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
-    a, b = u - 0.5 - x, v - 0.5 - y
-    x1, y1 = x + 1, y + 1
-    if x < 0 or y < 0 or x1 >= width or y1 >= height:
-        if wrap:
-            x, x1, y, y1 = x % width, x1 % width, y % height, y1 % height
-        else:
-            x, x1 = min(max(x, 0), width - 1), min(max(x1, 0), width - 1)
-            y, y1 = min(max(y, 0), height - 1), min(max(y1, 0), height - 1)
-    here, below = start + y * width, start + y1 * width
-    w00, w10, w01, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
-    for c in range(3):
-        colour[c] += (
-            w00 * texels[here + x, c]
-            + w10 * texels[here + x1, c]
-            + w01 * texels[below + x, c]
-            + w11 * texels[below + x1, c]
-        )
-
-
-@nb.njit(cache=True, nogil=True)
-def sample(texels, start, size, levels, face, uv, ux, vx, uy, vy, wrap, colour):
-    """Fill `colour` (3,) with a texture's mean over a pixel.
-
-    start, size and levels are those of one texture; (ux, vx) and (uy, vy) are the footprint's
-    sides, in coordinates that run from 0 to 1 over the image.
-    """
-    height, width = size[0, 0], size[0, 1]
-    side_x = np.hypot(ux * width, vx * height)
-    side_y = np.hypot(uy * width, vy * height)
-    if not abs(uv[0]) + abs(uv[1]) + side_x + side_y < 1e9:  # a ray along the surface
-        colour[:] = texels[start[levels - 1] + face]
-        return
-    # The level at which the shorter side is 1 to 2 texels, unless that takes too many look-ups
-    # along the longer one: two for every texel.
-    level, short, long = 0, min(side_x, side_y), max(side_x, side_y)
-    while level < levels - 1 and (short >= 2.0 or long > 0.5 * TAPS):
-        level, short, long = level + 1, 0.5 * short, 0.5 * long
-    each = 2.0 / 2**level
-    nx = min(max(int(np.ceil(each * side_x)), 2), TAPS)
-    ny = min(max(int(np.ceil(each * side_y)), 2), TAPS)
-    height, width = size[level, 0], size[level, 1]
-    first = start[level] + face * height * width
-    colour[:] = 0.0
-    for i in range(nx):
-        p = (i + 0.5) / nx - 0.5
-        for j in range(ny):
-            q = (j + 0.5) / ny - 0.5
-            u, v = uv[0] + p * ux + q * uy, uv[1] + p * vx + q * vy
-            _bilinear(texels, first, height, width, u * width, v * height, wrap, colour)
-    colour /= nx * ny
-
-
-@nb.njit(cache=True, nogil=True)
-def onto_cube(here, right, below):
-    """The face of a cube that a direction (3,) meets; it and its sides become u and v there.
-
-    The table of OpenGL 4.6, section 8.13.
-    """
-    x, y, z = here[0], here[1], here[2]
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face, u, v, m = (0, 2, 1, 0) if x > 0.0 else (1, 2, 1, 0)
-        su, sv = (-1.0 if x > 0.0 else 1.0), -1.0
-    elif ay >= az:
-        face, u, v, m = (2, 0, 2, 1) if y > 0.0 else (3, 0, 2, 1)
-        su, sv = 1.0, (1.0 if y > 0.0 else -1.0)
-    else:
-        face, u, v, m = (4, 0, 1, 2) if z > 0.0 else (5, 0, 1, 2)
-        su, sv = (1.0 if z > 0.0 else -1.0), -1.0
-    far = max(abs(here[m]), 1e-12)
-    sign = 1.0 if here[m] > 0.0 else -1.0
-    p, q = su * here[u] / far, sv * here[v] / far
-    for side in (right, below):
-        grow = sign * side[m]
-        a, b = (su * side[u] - p * grow) / far, (sv * side[v] - q * grow) / far
-        side[0], side[1] = 0.5 * a, 0.5 * b
-    here[0], here[1] = 0.5 + 0.5 * p, 0.5 + 0.5 * q
-    return face
