@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable
@@ -94,7 +95,12 @@ def generate(
             writer.write_calibration(board)
     write_json(
         out / SCENE,
-        {"scene": scene, "seed": options.seed, "model": "scene.xml", "frames": total},
+        {
+            "scene": header["source"]["scene"],
+            "seed": options.seed,
+            "model": "scene.xml",
+            "frames": total,
+        },
     )
     return out
 
@@ -127,6 +133,7 @@ def draw_stages(scene: str, path: str | Path, options: GenerateOptions, frame: i
 def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = None) -> Path:
     """Render a generated dataset anew from what it says about itself; equal bytes come out.
 
+    A scene that was an MJCF file is read from the dataset itself, whose own hash is then another.
     DatasetError where `dataset` was not generated, or with other versions than those here.
     """
     source = Dataset.open(dataset).header.get("source", {})
@@ -140,7 +147,9 @@ def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = No
     config: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()
     }
-    return generate(source["scene"], out, GenerateOptions(**config), progress)
+    stored = Path(dataset) / "scene" / "scene.xml"
+    scene = str(stored) if "scene_sha256" in source else source["scene"]
+    return generate(scene, out, GenerateOptions(**config), progress)
 
 
 def _source(scene: str, options: GenerateOptions) -> dict[str, Any]:
@@ -148,7 +157,7 @@ def _source(scene: str, options: GenerateOptions) -> dict[str, Any]:
     source: dict[str, Any] = {
         "tool": "depthba generate",
         "version": __version__,
-        "scene": scene,
+        "scene": Path(scene).name if Path(scene).is_file() else scene,
         "config": json.loads(json.dumps(asdict(options))),
         "versions": _versions(),
     }
@@ -157,6 +166,7 @@ def _source(scene: str, options: GenerateOptions) -> dict[str, Any]:
     return source
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("mujoco", "embreex", "numpy", "scipy")}
 

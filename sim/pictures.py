@@ -36,7 +36,7 @@ def overview(capture: Capture) -> tuple[NDArray[np.uint8], Camera, Array]:
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     towards = np.array([0.62, 0.85, 0.62]) / np.linalg.norm([0.62, 0.85, 0.62])
     camera = Camera(*_SIZE, 1250.0, 1250.0, 0.5 * (_SIZE[0] - 1), 0.5 * (_SIZE[1] - 1))
-    T = look(centre + 2.05 * radius * towards, centre - [0.0, 0.0, 0.12 * radius])
+    T = look(centre + 2.2 * radius * towards, centre - [0.0, 0.0, 0.12 * radius])
     return view.painter.paint(camera, T, view.rays.view(camera, T)), camera, T
 
 

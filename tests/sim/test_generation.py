@@ -94,7 +94,7 @@ def own_model(tmp_path: Path) -> Path:
     model = tmp_path / "yard.xml"
     model.write_text(
         """<mujoco model="yard"><compiler meshdir="meshes"/><asset><mesh file="tent.obj"/>
-        <texture name="tile" type="2d" file="meshes/../tile.png"/><material name="m" texture="tile"/>
+        <texture name="t" type="2d" file="meshes/../tile.png"/><material name="m" texture="t"/>
         </asset><worldbody><geom type="plane" size="3 3 .1" material="m"/>
         <geom type="mesh" mesh="tent" pos="0.1 0.2 0"/>
         <body pos="-0.5 0 0.2"><freejoint/><geom size="0.2"/></body></worldbody></mujoco>"""
@@ -117,6 +117,14 @@ def test_an_mjcf_file_is_a_scene(own_model: Path, tmp_path: Path) -> None:
         assert len(points) > 10_000
         again = scene.cast(T[:3, 3], points - T[:3, 3]).distance
         assert np.median(np.abs(again - 1.0)) * 2.0 < 5e-5
+    # Rendered anew from the stored scene alone, the frames are the same.
+    own_model.unlink()
+    again, first = contents(sim.rebuild(path, tmp_path / "again")), contents(path)
+    assert again.keys() == first.keys()
+    assert {name for name in first if again[name] != first[name]} <= {
+        "dataset.json",
+        "scene/scene.json",
+    }
     seen = np.concatenate([frame.depth().ravel() for frame in dataset])
     assert np.ptp(seen[np.isfinite(seen)]) > 0.4  # ball and tent, not the floor alone
 
