@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 
 LANES = 16
 
-_COHERENT = 1 << 16
+_COHERENT, _ROBUST = 1 << 16, 1 << 2
 _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 
 
@@ -69,6 +69,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
         ("rtcReleaseDevice", None, [pointer]),
         ("rtcNewScene", pointer, [pointer]),
         ("rtcReleaseScene", None, [pointer]),
+        ("rtcSetSceneFlags", None, [pointer, number]),
         ("rtcNewGeometry", pointer, [pointer, number]),
         ("rtcSetNewGeometryBuffer", pointer, [pointer, number, number, number, size, size]),
         ("rtcCommitGeometry", None, [pointer]),
@@ -93,6 +94,8 @@ class Packets:
         self._library = library
         self._device = library.rtcNewDevice(b"threads=1,set_affinity=0")
         self._scene = library.rtcNewScene(self._device)
+        # Else a ray in a million slips through where two triangles meet.
+        library.rtcSetSceneFlags(self._scene, _ROBUST)
         geometry = library.rtcNewGeometry(self._device, _TRIANGLES)
         for role, kind, data in ((_VERTEX, _FLOAT3, vertices), (_INDEX, _UINT3, faces)):
             there = library.rtcSetNewGeometryBuffer(geometry, role, 0, kind, 12, len(data))
@@ -144,7 +147,7 @@ class Singles:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene: Any = EmbreeScene()
+        self._scene: Any = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, vertices, faces)
 
     def first(self, origins: Floats, directions: Floats) -> NDArray[np.int32]:

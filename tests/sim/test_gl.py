@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from depthba.camera import Camera
 from depthba.errors import MissingPackage
@@ -10,15 +11,13 @@ from sim.engine import mujoco
 from sim.errors import SimulationError
 from sim.raycast import RayScene
 from sim.shading import Lighting, Painter
-from tests.sim.test_raycast import KINDS, inside, zoo
+from tests.sim.test_raycast import KINDS, inside, slanted, zoo
 from tests.sim.test_shading import textured
 
 needs_gl = pytest.mark.skipif(
     gl.available() is None, reason="neither EGL nor OSMesa works on this machine"
 )
-SLANTED = np.array(
-    [[1, 0, 0, 0], [0, -0.96, 0.28, -0.7], [0, -0.28, -0.96, 2.6], [0, 0, 0, 1]], float
-)
+SLANTED = slanted()
 
 
 @needs_gl
@@ -101,6 +100,26 @@ def test_textures_lie_as_in_opengl(sort: str, uniform: bool) -> None:
         # In OpenGL a capsule has seams, and a cube's middle plane is undefined.
         if kind != KINDS.mjGEOM_CAPSULE and (kind, sort) != (KINDS.mjGEOM_PLANE, "cube"):
             assert close.mean() > 0.92
+
+
+@needs_gl
+def test_the_sky_hangs_as_in_opengl() -> None:
+    spec, rng = mujoco.MjSpec(), np.random.default_rng(6)
+    pixels = np.kron(rng.integers(0, 256, (24, 4, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+    sky = spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, nchannel=3, height=384, width=64
+    )
+    sky.data = pixels.tobytes()
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_BOX, size=[0.01, 0.01, 0.01])
+    model, camera = spec.compile(), Camera(160, 120, 70.0, 70.0, 79.5, 59.5)
+    scene = RayScene.of_model(model)
+    with gl.GlRenderer(model) as renderer:
+        for k in range(3):
+            T = np.eye(4)
+            T[:3, :3] = Rotation.random(random_state=k).as_matrix()
+            T[:3, 3] = 1.0, 2.0, 3.0
+            ours = Painter(scene, model).paint(camera, T, scene.view(camera, T)).astype(int)
+            assert (np.abs(ours - renderer.rgb(camera, T)).max(axis=-1) < 40).mean() > 0.95
 
 
 def test_without_opengl_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,10 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from depthba.camera import Camera
+from sim import embree
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.raycast import RayScene
+from sim.raycast import RayScene, world_rays
 
 KINDS = mujoco.mjtGeom
 
@@ -70,12 +71,26 @@ def zoo() -> mujoco.MjSpec:
     return spec
 
 
-def test_every_kind_of_geom_agrees_with_mujocos_own_rays() -> None:
-    model = zoo().compile()
-    camera = Camera(240, 180, 200.0, 200.0, 119.5, 89.5)
+def slanted() -> np.ndarray:
+    """T_world_camera that has the whole zoo in sight."""
     T = np.eye(4)
     T[:3, :3] = np.array([[1, 0, 0], [0, -0.96, 0.28], [0, -0.28, -0.96]])
     T[:3, 3] = 0.0, -0.7, 2.6
+    return T
+
+
+def grazing() -> np.ndarray:
+    """T_world_camera that looks along the ground."""
+    T = np.eye(4)
+    T[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    T[:3, 3] = 0.2, -3.0, 0.1
+    return T
+
+
+def test_every_kind_of_geom_agrees_with_mujocos_own_rays() -> None:
+    model = zoo().compile()
+    camera = Camera(240, 180, 200.0, 200.0, 119.5, 89.5)
+    T = slanted()
     hits = RayScene.of_model(model).view(camera, T)
     depth, geom = oracle(model, camera, T)
     both = inside(geom) & (geom >= 0)
@@ -133,6 +148,95 @@ def test_shadows_are_where_something_stands_in_the_way() -> None:
     points = np.array([[0.0, 0, 0.001], [1.0, 0, 0.001]])
     np.testing.assert_array_equal(scene.blocked(points, np.array([0, 0, 1.0])), [True, False])
     np.testing.assert_array_equal(scene.blocked(points, np.array([-1.0, 0, 1.0])), [False, True])
+    each = np.array([[-1.0, 0, 1.0], [-1.0, 0, 1.0]])
+    np.testing.assert_array_equal(scene.blocked(points, each), [False, True])
+    np.testing.assert_array_equal(scene.blocked(points, each, np.array([9.0, 0.5])), [False] * 2)
+    np.testing.assert_array_equal(scene.blocked(np.full((1, 3), np.nan), each[0]), [False])
+
+
+def test_what_a_camera_sees_is_visible_from_there_and_not_through_a_box() -> None:
+    scene = RayScene.of_model(zoo().compile())
+    camera = Camera(161, 121, 140.0, 140.0, 80.0, 60.0)
+    for T in (slanted(), grazing()):
+        distance = scene.view(camera, T).distance
+        points = T[:3, 3] + world_rays(camera, T) * distance[..., None]
+        seen = scene.visible_from(points, T[:3, 3])
+        np.testing.assert_array_equal(seen, np.isfinite(distance))  # no acne, NaN is unseen
+        aside = T[:3, 3] + [0.4, 0.1, 0.0]
+        hits = scene.cast(aside, points - aside)
+        clear = np.abs(hits.distance - 1.0)
+        sure = np.isfinite(distance) & ((clear < 1e-6) | (clear > 1e-3))
+        np.testing.assert_array_equal(scene.visible_from(points, aside)[sure], (clear < 1e-6)[sure])
+
+
+def test_incidence_and_normals_of_a_slope() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(
+        type=KINDS.mjGEOM_BOX, size=[0.5, 0.5, 0.01], quat=[np.cos(0.3), np.sin(0.3), 0, 0]
+    )
+    scene = RayScene.of_model(spec.compile())
+    camera, T = Camera(41, 31, 30.0, 30.0, 20.0, 15.0), np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 2.0
+    hits = scene.view(camera, T)
+    cosine = scene.incidence(camera, T, hits)
+    normal = np.array([0.0, -np.sin(0.6), np.cos(0.6)])
+    assert cosine[15, 20] == pytest.approx(np.cos(0.6), abs=1e-12)
+    ray = T[:3, :3] @ camera.rays()[18, 23]
+    assert cosine[18, 23] == pytest.approx(abs(ray @ normal) / np.linalg.norm(ray), abs=1e-12)
+    np.testing.assert_allclose(scene.normals_of(hits)[15, 20], normal, atol=1e-12)
+    in_camera = scene.normals_of(hits, T)[15, 20]
+    np.testing.assert_allclose(in_camera, normal * [1, -1, -1], atol=1e-12)
+    np.testing.assert_array_equal(np.isnan(cosine), hits.triangle < 0)
+    np.testing.assert_array_equal(np.isnan(scene.normals_of(hits)[..., 0]), hits.triangle < 0)
+
+
+def test_packets_find_what_single_rays_find() -> None:
+    scene = RayScene.of_model(zoo().compile())
+    triangles = scene.triangles
+    single = embree.Singles(triangles.vertices.astype("f4"), triangles.faces.astype("i4"))
+    camera, T = Camera(161, 121, 140.0, 140.0, 80.0, 60.0), slanted()  # no multiple of four
+    hits = scene.view(camera, T)
+    rays = world_rays(camera, T).reshape(-1, 3)
+    eye = T[None, :3, 3].astype(np.float32)
+    alone = single.first(eye, rays.astype(np.float32)).reshape(hits.triangle.shape)
+    assert (alone == hits.triangle).mean() > 0.999  # on an edge it may be either
+    np.testing.assert_array_equal(
+        hits.triangle, scene.cast(T[:3, 3], rays).triangle.reshape(121, -1)
+    )
+    points = (T[:3, 3] + rays * hits.distance.reshape(-1, 1) * 0.99999).astype(np.float32)
+    lamp, reach = np.array([[0.4, -0.3, 0.6]], np.float32), np.array([0.5], np.float32)
+    both = [caster.blocked(points, lamp, reach) for caster in (single, scene._embree)]
+    assert 0.02 < both[0].mean() < 0.5
+    assert (both[0] == both[1]).mean() > 0.999
+
+
+def test_no_ray_slips_between_the_cells_of_a_height_field() -> None:
+    spec, rng = mujoco.MjSpec(), np.random.default_rng(1)
+    heights = rng.random((400, 400)).astype(np.float32)
+    spec.add_hfield(name="g", nrow=400, ncol=400, size=[2, 2, 0.1, 0.1], userdata=heights.ravel())
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_HFIELD, hfieldname="g")
+    camera, T = Camera(800, 600, 800.0, 800.0, 399.5, 299.5), np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 3.0
+    distance = RayScene.of_model(spec.compile()).view(camera, T).distance
+    assert distance.max() < 3.0  # neither through it nor onto its base
+    assert distance.min() > 2.89
+
+
+def test_another_pose_of_the_joints_reuses_the_shapes() -> None:
+    spec = zoo()
+    arm = spec.worldbody.add_body(pos=[0, 0, 0.3])
+    arm.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.3, 0.2, 1])
+    arm.add_geom(type=KINDS.mjGEOM_CAPSULE, size=[0.05, 0.4, 0], quat=[1, 1, 0, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[0] = 1.1
+    mujoco.mj_kinematics(model, data)
+    moved, fresh = RayScene.of_model(model).at(data), RayScene.of_model(model, data)
+    for name in ("vertices", "faces", "geom", "curved", "corner_normals"):
+        theirs = getattr(fresh.triangles, name)
+        np.testing.assert_array_equal(getattr(moved.triangles, name), theirs)
+    with pytest.raises(SimulationError, match="bare triangles"):
+        RayScene(fresh.triangles).at(data)
 
 
 def test_the_bay_agrees_with_mujocos_own_rays(bay_model: mujoco.MjModel) -> None:

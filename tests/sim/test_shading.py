@@ -5,8 +5,9 @@ import pytest
 
 from depthba.camera import Camera
 from sim.engine import mujoco
-from sim.raycast import RayScene
-from sim.shading import Lighting, Painter
+from sim.raycast import RayScene, world_rays
+from sim.shading import Finish, Lighting, Painter, colours_of
+from sim.tessellate import Triangles
 
 KINDS = mujoco.mjtGeom
 EVEN = Lighting(lamp=0.0, sky=1.0, ground=1.0)
@@ -118,3 +119,83 @@ def test_the_edge_of_a_square_lies_where_the_geometry_says(distance: float) -> N
             error.append(first - 0.5 + share.sum() - u)
     assert np.abs(np.mean(error)) < 0.005
     assert np.max(np.abs(error)) < 0.02
+
+
+def test_a_geoms_own_colour_wins_over_its_materials() -> None:
+    spec = mujoco.MjSpec()
+    spec.add_material(name="steel", rgba=[0.1, 0.2, 0.3, 1], specular=0.8, shininess=0.5)
+    for change in ({}, {"rgba": [0.7, 0.6, 0.5, 1]}, {"rgba": [0.7, 0.6, 0.5, 0]}):
+        spec.worldbody.add_geom(
+            type=KINDS.mjGEOM_BOX, size=[0.1, 0.1, 0.1], material="steel", **change
+        )
+    model = spec.compile()
+    np.testing.assert_allclose(
+        colours_of(model), [[0.1, 0.2, 0.3], [0.7, 0.6, 0.5], [0.7, 0.6, 0.5]], atol=1e-7
+    )
+    finish = Finish.of_model(model)
+    np.testing.assert_allclose(finish.gloss, 0.4, atol=1e-6)
+    assert finish.reflectance[1] == pytest.approx(0.7 * 0.2126 + 0.6 * 0.7152 + 0.5 * 0.0722)
+    assert set(RayScene.of_model(model).triangles.geom) == {0, 1}  # the third is invisible
+
+
+def ball(**material: float) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.add_material(name="skin", rgba=[0.3, 0.3, 0.3, 1], **material)
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_SPHERE, size=[0.5, 0, 0], material="skin")
+    return spec.compile()
+
+
+def test_round_bodies_do_not_look_faceted_and_edges_stay_sharp() -> None:
+    camera, T = Camera(200, 200, 250.0, 250.0, 99.5, 99.5), above(2.0)
+    model, images = ball(specular=0, shininess=0), []
+    for segments in (48, 512):
+        scene = RayScene.of_model(model, segments=segments)
+        image = Painter(scene, model).paint(camera, T, scene.view(camera, T))
+        images.append(image[60:140, 60:140].astype(int))
+    assert np.abs(images[0] - images[1]).max() <= 4
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_CYLINDER, size=[0.2, 0.1, 0])
+    triangles = RayScene.of_model(spec.compile()).triangles
+    upright = np.abs(np.cross(*sides(triangles)))[:, 2] > 1e-9
+    np.testing.assert_array_equal(np.sort(triangles.curved), np.flatnonzero(~upright))
+    np.testing.assert_allclose(triangles.corner_normals[..., 2], 0.0, atol=1e-6)
+
+
+def sides(triangles: Triangles) -> tuple[np.ndarray, np.ndarray]:
+    corner = triangles.vertices[triangles.faces]
+    return corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+
+
+def test_the_highlight_is_where_the_lamp_is_mirrored_and_only_on_gloss() -> None:
+    camera, T = Camera(300, 300, 400.0, 400.0, 149.5, 149.5), above(2.0)
+    lamp = Lighting(towards=(0.6, 0.0, 0.8), lamp=1.0, sky=0.0, ground=0.0)
+    matt, shiny = (
+        picture(ball(specular=s, shininess=s), camera, T, lamp)[..., 0].astype(int)
+        for s in (0.0, 0.8)
+    )
+    extra = shiny - matt
+    v, u = np.unravel_index(np.argmax(extra), extra.shape)
+    scene = RayScene.of_model(ball())
+    hits = scene.view(camera, T)
+    half = np.array([0.6, 0.0, 0.8]) - world_rays(camera, T)[v, u]
+    half /= np.linalg.norm(half)
+    assert scene.normals_of(hits)[v, u] @ half > np.cos(np.radians(4.0))
+    assert extra.max() > 25
+
+
+def test_shadow_falls_away_from_the_lamp_and_equal_views_have_equal_bytes() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_PLANE, size=[2, 2, 0.1])
+    spec.worldbody.add_geom(type=KINDS.mjGEOM_BOX, size=[0.1, 0.1, 0.2], pos=[0, 0, 0.2])
+    camera, T = Camera(200, 200, 200.0, 200.0, 99.5, 99.5), above(2.0)
+    lamp = Lighting(towards=(-1.0, 0.0, 1.0))
+    model = spec.compile()
+    image = picture(model, camera, T, lamp)
+    row = image[100, :, 0].astype(int)  # x grows with u, 100 px a metre on the plane
+    assert row[120] < row[60] - 30  # behind the box, 0.2 m to the right
+    assert row[60] == row[180]
+    np.testing.assert_array_equal(image, picture(model, camera, T, lamp))
+    scene = RayScene.of_model(model)
+    painter = Painter(scene, model, lamp)
+    again = painter.at(scene).paint(camera, T, scene.view(camera, T))
+    np.testing.assert_array_equal(image, again)
