@@ -26,42 +26,55 @@ def crease(
     return chosen, normals[chosen]
 
 
+@nb.njit(cache=True, nogil=True, inline="always")
+def _side(vertices, a, b):
+    return (
+        vertices[b, 0] - vertices[a, 0],
+        vertices[b, 1] - vertices[a, 1],
+        vertices[b, 2] - vertices[a, 2],
+    )
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bend(vertices, faces, cosine, normals, curved):
     own, angle = np.zeros((len(faces), 3)), np.zeros((len(faces), 3))
     first = np.zeros(len(vertices) + 2, np.int64)
     for k in range(len(faces)):
-        a, b, c = vertices[faces[k, 0]], vertices[faces[k, 1]], vertices[faces[k, 2]]
-        n = np.cross(b - a, c - a)
-        length = np.sqrt(n @ n)
-        if length > 0.0:
-            own[k] = n / length
         for j in range(3):
-            p = vertices[faces[k, j]]
-            u, v = vertices[faces[k, (j + 1) % 3]] - p, vertices[faces[k, (j + 2) % 3]] - p
-            across = np.cross(u, v)
-            angle[k, j] = np.arctan2(np.sqrt(across @ across), u @ v)
-            first[faces[k, j] + 2] += 1
+            a, b, c = faces[k, j], faces[k, (j + 1) % 3], faces[k, (j + 2) % 3]
+            ux, uy, uz = _side(vertices, a, b)
+            vx, vy, vz = _side(vertices, a, c)
+            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            length = np.sqrt(x * x + y * y + z * z)
+            if length > 0.0:
+                own[k, 0], own[k, 1], own[k, 2] = x / length, y / length, z / length
+            angle[k, j] = np.arctan2(length, ux * vx + uy * vy + uz * vz)
+            first[a + 2] += 1
     # The faces around each vertex, one vertex after the other.
     for i in range(2, len(first)):
         first[i] += first[i - 1]
-    around = np.empty((first[-1], 2), np.int64)
+    around, corner = np.empty(first[-1], np.int64), np.empty(first[-1], np.int64)
     for k in range(len(faces)):
         for j in range(3):
             at = first[faces[k, j] + 1]
-            around[at, 0], around[at, 1] = k, j
+            around[at], corner[at] = k, j
             first[faces[k, j] + 1] += 1
-    total = np.empty(3)
     for k in range(len(faces)):
         curved[k] = False
+        nx, ny, nz = own[k, 0], own[k, 1], own[k, 2]
         for j in range(3):
-            total[:] = 0.0
-            vertex = faces[k, j]
-            for at in range(first[vertex], first[vertex + 1]):
-                f, corner = around[at]
-                if own[f] @ own[k] > cosine:
-                    total += angle[f, corner] * own[f]
-            length = np.sqrt(total @ total)
-            mean = total / length if length > 0.0 else own[k]
-            normals[k, j, 0], normals[k, j, 1], normals[k, j, 2] = mean[0], mean[1], mean[2]
-            curved[k] |= 1.0 - mean @ own[k] > _FLAT
+            x, y, z = 0.0, 0.0, 0.0
+            for at in range(first[faces[k, j]], first[faces[k, j] + 1]):
+                f = around[at]
+                if own[f, 0] * nx + own[f, 1] * ny + own[f, 2] * nz > cosine:
+                    weight = angle[f, corner[at]]
+                    x += weight * own[f, 0]
+                    y += weight * own[f, 1]
+                    z += weight * own[f, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            if length > 0.0:
+                x, y, z = x / length, y / length, z / length
+            else:
+                x, y, z = nx, ny, nz
+            normals[k, j, 0], normals[k, j, 1], normals[k, j, 2] = x, y, z
+            curved[k] |= 1.0 - (x * nx + y * ny + z * nz) > _FLAT
