@@ -30,6 +30,20 @@ class Lighting:
     sky: float = 0.55
     ground: float = 0.18
     """Ambient light from below, from bounces."""
+    shadows: bool = True
+    """Whether what stands in the lamp's way casts a shadow."""
+
+    @staticmethod
+    def of_model(model: mujoco.MjModel) -> Lighting:
+        """The first directional light of a model: where it shines from, and if it casts shadows.
+
+        Without one, the lamp as it is here.
+        """
+        for light in range(model.nlight):
+            if model.light_type[light] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+                x, y, z = (-float(v) for v in model.light_dir[light])
+                return Lighting((x, y, z), shadows=bool(model.light_castshadow[light]))
+        return Lighting()
 
 
 def colours_of(model: mujoco.MjModel) -> Array:
@@ -69,9 +83,11 @@ class Painter:
     """Paints views of one scene; what depends on the scene only is worked out once."""
 
     def __init__(
-        self, scene: RayScene, model: mujoco.MjModel, lighting: Lighting = Lighting()
+        self, scene: RayScene, model: mujoco.MjModel, lighting: Lighting | None = None
     ) -> None:
         """Gather the geoms' materials and the textures."""
+        lighting = lighting or Lighting.of_model(model)
+        self._shadows = lighting.shadows
         lamp = np.array(lighting.towards) / np.linalg.norm(lighting.towards)
         self._lamp = lamp
         self._light = np.array([*lamp, lighting.lamp, lighting.sky, lighting.ground])
@@ -110,7 +126,8 @@ class Painter:
             hits.triangle, hits.distance, rays, T, normals, self._lamp, start, pixel
         )
         lit = np.zeros(hits.triangle.shape, np.bool_)
-        lit.ravel()[pixel[:count]] = ~self._scene.blocked(start[:count], self._lamp)
+        hidden = self._shadows and self._scene.blocked(start[:count], self._lamp)
+        lit.ravel()[pixel[:count]] = np.logical_not(hidden)
         image = np.empty((camera.height, camera.width, 3), np.uint8)
         painting.shade(
             hits.triangle, hits.geom, hits.distance, lit, rays, T, 1.0 / camera.fx, 1.0 / camera.fy,

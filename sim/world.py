@@ -53,8 +53,13 @@ class World:
             data = mujoco.MjData(self.model)
             data.qpos[:] = qpos
             mujoco.mj_kinematics(self.model, data)
-            rays = RayScene.of_model(self.model, data)
-            self._view = qpos.tobytes(), View(data, rays, Painter(rays, self.model))
+            if self._view is None:
+                rays = RayScene.of_model(self.model, data)
+                painter = Painter(rays, self.model)
+            else:  # the shapes stay, only their places change
+                rays = self._view[1].rays.at(data)
+                painter = self._view[1].painter.at(rays)
+            self._view = qpos.tobytes(), View(data, rays, painter)
         return self._view[1]
 
     @cached_property

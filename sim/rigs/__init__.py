@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 class Rig(Protocol):
     """Something that carries a sensor from pose to pose."""
 
+    @property
+    def frames(self) -> int:
+        """How many it takes unless told otherwise."""
+
     def track(
         self,
         model: mujoco.MjModel,

@@ -29,7 +29,7 @@ them."""
 class Arm:
     """A UR16e that carries a stereo camera from pose to pose; it must be in the scene's model."""
 
-    count: int = 12
+    frames: int = 12
     """Frames of a capture."""
     aims: Aims = field(default_factory=TableDome)
     """Where the camera should look from."""
@@ -47,7 +47,7 @@ class Arm:
 
     def plan(self, model: mujoco.MjModel, seed: int, frames: int | None = None) -> Plan:
         """The poses of a capture; SimulationError if the scene does not allow so many."""
-        count = self.count if frames is None else frames
+        count = self.frames if frames is None else frames
         if count < 1:
             raise OptionError(f"frames {count}: expected 1 or more")
         wanted = self.aims(stream(seed, "arm"), count)

@@ -131,10 +131,15 @@ class BoardArm:
     """A UR16e whose camera looks at the calibration board of the scene."""
 
     views: Views = field(default_factory=Views)
-    arm: Arm = field(default_factory=lambda: Arm(count=20, overlap=0.0))
+    arm: Arm = field(default_factory=lambda: Arm(frames=20, overlap=0.0))
     """Its aims are replaced by the views."""
     camera: Camera = field(default_factory=lambda: ZED2.camera)
     """What the views are made for; one that sees further to every side will do too."""
+
+    @property
+    def frames(self) -> int:
+        """How many it takes unless told otherwise."""
+        return self.arm.frames
 
     def track(
         self,

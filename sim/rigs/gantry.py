@@ -58,13 +58,18 @@ class Gantry:
     """Between frames: travel, settle, expose."""
     errors: GantryErrors = field(default_factory=GantryErrors)
 
+    @property
+    def frames(self) -> int:
+        """How many it takes unless told otherwise."""
+        return self.columns * self.rows
+
     def stations(self, frames: int | None = None) -> Array:
         """Camera centres (N, 3) m in order.
 
         Fewer frames than the grid holds keep its spacing and the corner at the origin; more make
         the columns denser.
         """
-        count = self.columns * self.rows if frames is None else frames
+        count = self.frames if frames is None else frames
         if count < 1:
             raise OptionError(f"frames {count}: expected 1 or more")
         rows = min(self.rows, count)

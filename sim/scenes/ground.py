@@ -79,7 +79,7 @@ def _heap(
     """A tipped load: a ridge with slopes just under the angle of repose."""
     cx, cy = rng.uniform(area[0], area[1]), rng.uniform(area[2], area[3])
     heading, length = rng.uniform(0.0, np.pi), rng.uniform(0.1, 0.7)
-    height, steep = rng.uniform(0.15, 0.36), np.tan(repose) * rng.uniform(0.6, 0.95)
+    height, steep = rng.uniform(0.11, 0.24), np.tan(repose) * rng.uniform(0.6, 0.95)
     along = (x - cx) * np.cos(heading) + (y - cy) * np.sin(heading)
     across = -(x - cx) * np.sin(heading) + (y - cy) * np.cos(heading)
     outside = np.maximum(np.abs(along) - 0.5 * length, 0.0)

@@ -191,7 +191,7 @@ def _bay(name: str, seed: int) -> tuple[mujoco.MjSpec, Floor]:
     shapes = make_shapes(spec, rng, CRUSHED, sizes, 8)
     lumps = make_shapes(spec, rng, SLAG, sizes[:-2], 4)
     shapes = shapes + lumps
-    diameters = draw_diameters(rng, 1300, 0.05, 0.34, 1.7)
+    diameters = draw_diameters(rng, 1300, 0.05, 0.34, 2.0)
     large = diameters > 0.18
     everywhere = clear + wide + raked
     off = tuple(Keep(k.x, k.y, k.radius + 0.25) for k in clear + raked)

@@ -162,7 +162,7 @@ def scatter(
         xs, ys = rng.uniform(area[0], area[1], 2), rng.uniform(area[2], area[3], 2)
         choosy = rng.random() < 0.4
         tilt, heading = rng.normal(scale=0.16, size=3), rng.uniform(0.0, 2.0 * np.pi)
-        sink = rng.uniform(0.80, 0.94)
+        sink = rng.uniform(0.85, 0.96)
         colours = shape.family.colours
         colour = np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.75, 1.2)
         pick = int(np.argmax(relief.at(xs, ys))) if choosy else 0

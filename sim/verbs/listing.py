@@ -13,7 +13,7 @@ from rich.table import Table
 
 from depthba.verbs.output import length
 from sim.noise import choose_stages
-from sim.rigs import RIGS, Rig, find_rig
+from sim.rigs import RIGS, find_rig
 from sim.scenes import SCENES
 from sim.sensors import SENSORS
 
@@ -26,7 +26,7 @@ def describe() -> dict[str, list[dict[str, Any]]]:
                 "id": scene.id,
                 "rig": scene.rig,
                 "sensor": scene.sensor,
-                "frames": _frames(find_rig(scene.rig)),
+                "frames": find_rig(scene.rig).frames,
                 "description": scene.description,
             }
             for scene in SCENES.values()
@@ -34,7 +34,7 @@ def describe() -> dict[str, list[dict[str, Any]]]:
         "rigs": [
             {
                 "name": name,
-                "frames": _frames(find_rig(name)),
+                "frames": find_rig(name).frames,
                 "description": _about(find_rig(name)),
             }
             for name in RIGS
@@ -108,14 +108,6 @@ def _sensor(sensor: dict[str, Any]) -> list[str]:
         f"{sensor['depth_min_m']:g} to {sensor['depth_max_m']:g} m",
         f"{length(noise['sigma_m'])} at {noise['at_m']:g} m{power}",
     ]
-
-
-def _frames(rig: Rig) -> int | None:
-    """How many frames the rig takes unless told otherwise; None: it does not say."""
-    frames: int | None = getattr(rig, "frames", None) or getattr(rig, "count", None)
-    if frames is None and hasattr(rig, "stations"):
-        frames = len(rig.stations())
-    return frames
 
 
 def _about(thing: object) -> str:
