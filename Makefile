@@ -18,7 +18,7 @@ demo: $(STAMP)  ## one scene from end to end: generate, register, evaluate, reco
 	@$(BIN)/depthba demo
 
 test: $(STAMP)  ## the fast tests
-	@$(BIN)/pytest
+	@$(BIN)/pytest -n auto --maxprocesses 8
 
 lint: $(STAMP)  ## ruff and mypy
 	@$(BIN)/ruff check

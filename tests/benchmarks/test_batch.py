@@ -17,7 +17,7 @@ from sim.batch import generate_many
 from sim.workers import cores
 
 CASES = {
-    "industrial-6": ("industrial-6", 8, sim.GenerateOptions(size=(320, 240), frames=6)),
+    "industrial-6": ("industrial-6", 8, sim.GenerateOptions(size=(640, 480), frames=12)),
     "heap": (
         "tests.sim.heaps:heap",
         48,
