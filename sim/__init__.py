@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sim.errors import SimulationError
     from sim.generation import Progress, generate, is_complete, rebuild
     from sim.options import GenerateOptions
-    from sim.raycast import RayScene
+    from sim.rendering.raycast import RayScene
     from sim.scenes import SCENES, Scene
     from sim.sensors import SENSORS, DepthSensor
 
@@ -20,7 +20,7 @@ _HOME = {
     "DepthSensor": "sim.sensors",
     "GenerateOptions": "sim.options",
     "Progress": "sim.generation",
-    "RayScene": "sim.raycast",
+    "RayScene": "sim.rendering.raycast",
     "SCENES": "sim.scenes",
     "SENSORS": "sim.sensors",
     "Scene": "sim.scenes",

@@ -18,6 +18,7 @@ from depthba import __version__
 from depthba.dataset import Dataset, DatasetWriter, Marker
 from depthba.durable import write_bytes, write_json, write_text
 from depthba.errors import DatasetError
+from sim import calibration
 from sim.capture import Capture
 from sim.markers import discs_of, observe
 from sim.noise import stated_noise
@@ -87,12 +88,9 @@ def generate(
         writer.write_markers(
             [Marker(disc.name, disc.p_world, tuple(seen[disc.name])) for disc in discs]
         )
-    if capture.world.model.ntext:
-        from sim import calibration
-
-        board = calibration.of_model(capture.world.model, capture.world.at().data, track)
-        if board is not None:
-            writer.write_calibration(board)
+    board = calibration.of_model(capture.world.model, capture.world.at().data, track)
+    if board is not None:
+        writer.write_calibration(board)
     write_json(
         out / SCENE,
         {

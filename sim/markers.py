@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from depthba.camera import Camera
 from depthba.se3 import inverse
 from sim.engine import mujoco
-from sim.raycast import Hits
+from sim.rendering.raycast import Hits
 
 Array = NDArray[np.float64]
 

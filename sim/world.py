@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.engine import mujoco
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.shading import Finish, Painter
 from sim.scenes import Scene
-from sim.shading import Finish, Painter
 
 if TYPE_CHECKING:
-    from sim.gl import GlRenderer
+    from sim.rendering.gl import GlRenderer
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,6 @@ class World:
     @cached_property
     def gl(self) -> GlRenderer:
         """MuJoCo's own renderer, to compare with; MissingPackage where there is no OpenGL."""
-        from sim.gl import GlRenderer
+        from sim.rendering.gl import GlRenderer
 
         return GlRenderer(self.model)

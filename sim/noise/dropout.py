@@ -10,8 +10,8 @@ from scipy.special import ndtr
 
 from sim.noise.shot import Image, Shot
 from sim.noise.window import windowed
+from sim.rendering.shading import Lighting
 from sim.sensors import DepthSensor
-from sim.shading import Lighting
 
 Array = NDArray[np.float64]
 

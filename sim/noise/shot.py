@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.raycast import Hits, RayScene
+from sim.rendering.raycast import Hits, RayScene
+from sim.rendering.shading import Finish
 from sim.sensors import DepthSensor
-from sim.shading import Finish
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

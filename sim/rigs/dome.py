@@ -11,9 +11,9 @@ from depthba import se3
 from depthba.errors import OptionError
 from sim.engine import mujoco
 from sim.errors import SimulationError
+from sim.rendering.tessellate import triangles_of
 from sim.rigs.track import Track, Triple, perturbed, scaled
 from sim.seeds import stream
-from sim.tessellate import triangles_of
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from sim.engine import mujoco
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.tessellate import Triangles
 from sim.scenes.relief import frame
 from sim.scenes.solids import Solid, joined
-from sim.tessellate import Triangles
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from sim.engine import mujoco
 from sim.errors import SimulationError
 from sim.markers import discs_of
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.tessellate import triangles_of
 from sim.scenes.relief import Relief, hull_of, turned
 from sim.scenes.stones import LOOSE
-from sim.tessellate import triangles_of
 
 Array = NDArray[np.float64]
 

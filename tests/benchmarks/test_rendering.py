@@ -13,10 +13,10 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from depthba.camera import Camera
-from sim.embree import Singles
 from sim.engine import mujoco
-from sim.raycast import RayScene, world_rays
-from sim.shading import Painter
+from sim.rendering.embree import Singles
+from sim.rendering.raycast import RayScene, world_rays
+from sim.rendering.shading import Painter
 
 CAMERA = Camera(1280, 720, 528.0, 528.0, 639.5, 359.5)
 T_WORLD_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -9,9 +9,9 @@ import numpy as np
 from sim.engine import mujoco
 from sim.noise import Stage, measure
 from sim.noise.shot import Shot
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.shading import Finish
 from sim.sensors import DepthSensor
-from sim.shading import Finish
 
 G = mujoco.mjtGeom
 

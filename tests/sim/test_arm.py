@@ -12,14 +12,14 @@ from depthba.errors import OptionError
 from depthba.kinematics import UR16E
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.tessellate import triangles_of
 from sim.rigs import find_rig
 from sim.rigs.arm import Arm
 from sim.rigs.clearance import Clearance
 from sim.rigs.planning import plan, shared_view
 from sim.robots.ur16e import BASE, CAMERA, LINKS, T_FLANGE_CAMERA, add_ur16e
 from sim.seeds import stream
-from sim.tessellate import triangles_of
 
 BOX, SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 READY = np.array([-1.927, -1.584, 1.424, -1.41, -1.571, -0.356])

@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 from sim.engine import mujoco
 from sim.markers import discs_of, observe
-from sim.raycast import RayScene, world_rays
+from sim.rendering.raycast import RayScene, world_rays
+from sim.rendering.shading import Finish
 from sim.rigs.gantry import Gantry
 from sim.scenes import find_scene
 from sim.scenes.ground import make_ground
@@ -19,7 +20,6 @@ from sim.scenes.stones import CRUSHED, Keep, draw_diameters, make_shapes, scatte
 from sim.scenes.workpieces import Coil, coil
 from sim.seeds import stream
 from sim.sensors import SP1000
-from sim.shading import Finish
 
 
 @dataclass(frozen=True)

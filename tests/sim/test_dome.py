@@ -12,7 +12,7 @@ from depthba.camera import Camera
 from depthba.errors import OptionError
 from sim.engine import mujoco
 from sim.pictures import draw_scene
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
 from sim.rigs.dome import Dome, extent, look
 from tests.sim.conftest import heap
 

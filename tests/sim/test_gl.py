@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from depthba.camera import Camera
 from depthba.errors import MissingPackage
-from sim import gl
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.raycast import RayScene
-from sim.shading import Lighting, Painter
+from sim.rendering import gl
+from sim.rendering.raycast import RayScene
+from sim.rendering.shading import Lighting, Painter
 from tests.sim.test_raycast import KINDS, inside, slanted, zoo
 from tests.sim.test_shading import textured
 

@@ -11,7 +11,7 @@ import sim
 from depthba.dataset import Dataset, verify
 from depthba.se3 import inverse
 from sim.engine import mujoco
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
 from sim.rigs.gantry import Gantry
 from sim.scenes import find_scene
 from sim.sensors import SP1000

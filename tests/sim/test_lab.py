@@ -11,14 +11,14 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
+from sim.rendering.tessellate import Triangles, triangles_of
 from sim.scenes import lab
 from sim.scenes.machined import flange, stepped_shaft
 from sim.scenes.solids import Solid, circle, extrude, joined, polygon, rectangle, rounded
 from sim.scenes.table import WORK_AREA
 from sim.scenes.tools import TOOLS
 from sim.seeds import stream
-from sim.tessellate import Triangles, triangles_of
 
 BUILDERS = {"lab-1": lab.lab_1, "lab-2": lab.lab_2, "lab-3": lab.lab_3}
 SLACK = 1e-4

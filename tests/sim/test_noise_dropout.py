@@ -8,8 +8,8 @@ import pytest
 from sim.noise import measure
 from sim.noise.dropout import Dropout
 from sim.noise.shot import Shot
+from sim.rendering.shading import Lighting
 from sim.sensors import SP1000, ZED2, DepthSensor
-from sim.shading import Lighting
 from tests.sim.shots import floor, narrow
 
 SP = narrow(SP1000.resized(320, 240))

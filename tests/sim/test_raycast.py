@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from depthba.camera import Camera
-from sim import embree
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.raycast import RayScene, world_rays
+from sim.rendering import embree
+from sim.rendering.raycast import RayScene, world_rays
 
 KINDS = mujoco.mjtGeom
 

@@ -6,7 +6,7 @@ import pytest
 from sim.engine import mujoco
 from sim.errors import SimulationError
 from sim.markers import discs_of
-from sim.raycast import RayScene
+from sim.rendering.raycast import RayScene
 from sim.scenes import find_scene
 from sim.scenes.relief import Relief
 from sim.scenes.settling import Settling, settle

@@ -5,9 +5,9 @@ import pytest
 
 from depthba.camera import Camera
 from sim.engine import mujoco
-from sim.raycast import RayScene, world_rays
-from sim.shading import Finish, Lighting, Painter, colours_of
-from sim.tessellate import Triangles
+from sim.rendering.raycast import RayScene, world_rays
+from sim.rendering.shading import Finish, Lighting, Painter, colours_of
+from sim.rendering.tessellate import Triangles
 
 KINDS = mujoco.mjtGeom
 EVEN = Lighting(lamp=0.0, sky=1.0, ground=1.0)

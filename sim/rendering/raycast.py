@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.camera import Camera
-from sim import embree
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.tessellate import SEGMENTS, Shapes, Triangles
+from sim.rendering import embree
+from sim.rendering.tessellate import SEGMENTS, Shapes, Triangles
 
 Array = NDArray[np.float64]
 

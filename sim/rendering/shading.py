@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.camera import Camera
-from sim import painting
 from sim.engine import mujoco
-from sim.raycast import Hits, RayScene
+from sim.rendering import painting
+from sim.rendering.raycast import Hits, RayScene
+from sim.rendering.tessellate import UNSET, Triangles
+from sim.rendering.textures import Textures, linear_to_srgb, texture_of
 from sim.seeds import stream
-from sim.tessellate import UNSET, Triangles
-from sim.textures import Textures, linear_to_srgb, texture_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

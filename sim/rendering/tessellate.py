@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.creases import crease
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.textures import coordinates
+from sim.rendering.creases import crease
+from sim.rendering.textures import coordinates
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

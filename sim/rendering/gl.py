@@ -34,7 +34,7 @@ PLATFORMS = {"egl": "libegl1 libgl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
 FACETS = 256
 """Slices and stacks of round shapes; MuJoCo's 28 would be off by up to 1.3 mm."""
 
-_TRIAL = "import sys; from sim.gl import _context; _context(sys.argv[1])"
+_TRIAL = "import sys; from sim.rendering.gl import _context; _context(sys.argv[1])"
 
 
 @cache
