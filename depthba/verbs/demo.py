@@ -85,7 +85,7 @@ def _generate(path: Path, seed: int) -> Path:
     sim = importlib.import_module("sim")
     progress = importlib.import_module("sim.verbs.progress")
     options = sim.GenerateOptions(
-        seed=seed, frames=FRAMES, size=SIZE, start_error=START_ERROR, rgb=True
+        seed=seed, frames=FRAMES, size=SIZE, start_error=START_ERROR, rgb=False
     )
     with progress.FrameProgress(SCENE) as show:
         generated: Path = sim.generate(SCENE, path, options, show)

@@ -26,7 +26,7 @@ def crease(
     return chosen, normals[chosen]
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _side(vertices, a, b):
     return (
         vertices[b, 0] - vertices[a, 0],

@@ -17,7 +17,7 @@ GRAIN_CELL = 0.007
 """Width of a speckle of loose ground, m."""
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _bilinear(texels, start, height, width, u, v, wrap, colour):
     """Add the colour at (u, v), in texels, to `colour`."""
     x, y = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
@@ -101,7 +101,7 @@ def onto_cube(here, right, below):
     return face
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _place(rays, y, x, t, T):
     """Direction of a pixel's ray and its point at t, world frame (6 values)."""
     a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
@@ -111,7 +111,7 @@ def _place(rays, y, x, t, T):
     return dx, dy, dz, T[0, 3] + t * dx, T[1, 3] + t * dy, T[2, 3] + t * dz
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _seen_side(normals, k, dx, dy, dz):
     """A triangle's normal on the side it is seen from."""
     nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
@@ -143,7 +143,7 @@ def towards_lamp(triangle, distance, rays, T, normals, lamp, start, pixel):
     return count
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _shares(vertices, face, frame):
     """Fill `frame` (3, 3): a corner, and the gradients of the other two corners' shares."""
     a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
@@ -160,7 +160,7 @@ def _shares(vertices, face, frame):
     frame[2, 2] = (nx * uy - ny * ux) * scale
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True)
 def _dot(row, x, y, z):
     return row[0] * x + row[1] * y + row[2] * z
 
@@ -186,13 +186,14 @@ def shade(
             k = triangle[y, x]
             dx, dy, dz, px, py, pz = _place(rays, y, x, distance[y, x], T)
             if k < 0:
-                albedo[:] = 0.02
+                albedo[0] = albedo[1] = albedo[2] = 0.02
                 if sky >= 0:  # MuJoCo's boxes of sky stand on their side
                     here[0], here[1], here[2] = dx, dz, -dy
                     right[0], right[1], right[2] = T[0, 0], T[2, 0], -T[1, 0]
                     below[0], below[1], below[2] = T[0, 1], T[2, 1], -T[1, 1]
-                    right *= step_x
-                    below *= step_y
+                    for c in range(3):
+                        right[c] *= step_x
+                        below[c] *= step_y
                     face = onto_cube(here, right, below)
                     sample(
                         texels, start[sky], size[sky], levels[sky], face, here,
@@ -203,7 +204,8 @@ def shade(
                 continue
             g = geom[y, x]
             nx, ny, nz = _seen_side(normals, k, dx, dy, dz)
-            albedo[:] = colour[g]
+            for c in range(3):
+                albedo[c] = colour[g, c]
             bent = curved[k] if len(curved) else -1
             r = row[k] if len(row) else -1
             if bent >= 0 or r >= 0:
@@ -239,7 +241,9 @@ def shade(
                     albedo[c] *= texel[c]
             if loose[g]:
                 u, v = int(px / GRAIN_CELL), int(py / GRAIN_CELL)
-                albedo *= grain[u & (len(grain) - 1), v & (len(grain) - 1)]
+                speckle = grain[u & (len(grain) - 1), v & (len(grain) - 1)]
+                for c in range(3):
+                    albedo[c] *= speckle
             if bent >= 0:  # Phong 1975
                 side = 1.0 if _dot(normals[k], nx, ny, nz) > 0.0 else -1.0
                 b, rest = bend[bent], 1.0 - share1 - share2
