@@ -67,4 +67,6 @@ system_libraries
 virtual_environment
 echo "setup: installing the packages into .venv (about 3 GB; minutes the first time)"
 packages
+echo "setup: compiling the kernels"
+.venv/bin/python -m depthba.optimiser.warm
 echo "setup: done"
