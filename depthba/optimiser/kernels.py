@@ -217,6 +217,66 @@ def block_gradient(
 
 
 @nb.njit(cache=True, nogil=True)
+def noise_gradient(
+    points, R, t, origin, spacing, nodes, along_ray, slope, front, cap, weights, draws, gradient,
+):  # fmt: skip
+    """Add to ``gradient`` (ny, nx) what residuals ``draws`` (n,) times the points' sigma would."""
+    for k in range(points.shape[0]):
+        if weights[k] <= 0.0:
+            continue
+        on, x, y, a, b, _, _, _, _, norm, _, _ = _residual(
+            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+            along_ray, slope, front, cap,
+        )  # fmt: skip
+        if not on:
+            continue
+        e = points[k, 4] * weights[k] * points[k, 3] / norm * draws[k]
+        gradient[y, x] -= (1 - a) * (1 - b) * e
+        gradient[y, x + 1] -= a * (1 - b) * e
+        gradient[y + 1, x] -= (1 - a) * b * e
+        gradient[y + 1, x + 1] -= a * b * e
+
+
+@nb.njit(cache=True, nogil=True)
+def slope_noise(
+    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
+    weights, noise, A, B, bx, by,
+):  # fmt: skip
+    """Accumulate ``A`` (6, 6) and ``B`` (h, w, 6) of Jacobians that hold slope noise alone.
+
+    ``noise`` (ny, nx, 3) are nodes of a map that is nothing but noise; the rest is as for
+    :func:`accumulate`. Only the lower triangle of ``A`` is filled.
+    """
+    j = np.zeros(6)
+    height, width = B.shape[0], B.shape[1]
+    for k in range(points.shape[0]):
+        if weights[k] <= 0.0:
+            continue
+        on, x, y, a, b, qx, qy, qz, _, norm, _, _ = _residual(
+            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+            along_ray, slope, front, cap,
+        )  # fmt: skip
+        if not (on and x >= bx and y >= by and x + 1 < bx + width and y + 1 < by + height):
+            continue
+        scale = points[k, 3] / norm
+        w = points[k, 4] * weights[k] * scale * scale
+        _, gx, gy = _read(noise, x, y, a, b)
+        lx, ly, lz = qx + arm[0], qy + arm[1], qz + arm[2]
+        j[0], j[1], j[2] = -gx, -gy, 0.0
+        j[3], j[4], j[5] = lz * gy, -lz * gx, -lx * gy + ly * gx
+        h00, h10, h01, h11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+        lower, upper = B[y - by], B[y + 1 - by]
+        for m in range(6):
+            wj = w * j[m]
+            for n in range(m + 1):
+                A[m, n] += wj * j[n]
+            lower[x - bx, m] -= wj * h00
+            lower[x + 1 - bx, m] -= wj * h10
+            upper[x - bx, m] -= wj * h01
+            upper[x + 1 - bx, m] -= wj * h11
+
+
+@nb.njit(cache=True, nogil=True)
 def splat(points, R, t, origin, spacing, total, count):
     """Add the points' heights to the nodes nearest to them: their sum and number, each (ny, nx)."""
     ny, nx = total.shape

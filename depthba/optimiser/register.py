@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from depthba import se3
 from depthba.dataset import Dataset
@@ -22,6 +23,7 @@ from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import PosePrior, pose_prior
 from depthba.optimiser.problem import Problem, prepare
 from depthba.optimiser.reporting import depth_map, frame_reports, iteration, verdict
+from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
 from depthba.options import Options
 from depthba.result import Iteration, Result
@@ -252,7 +254,12 @@ def _conclude(
     known = certainty.correlation(
         level.problem, level.grid, state, outcome.loss, lin, prior, free, workers, 1e-8
     )
-    factor, S = known.inflation, known.S
+    factor = known.inflation
+    held_by_prior = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])
+    S = without_slope_noise(
+        level.problem, level.grid, state, outcome.loss, lin, known.S,
+        factor * sigma**2 * held_by_prior, free, workers,
+    )  # fmt: skip
     judged = certainty.assess(
         level.problem, state, lin, S, factor * sigma**2, prior, preset.prior, free,
         tuple(f.id for f in dataset),

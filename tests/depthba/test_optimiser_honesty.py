@@ -47,7 +47,6 @@ def test_flat_plane_is_not_trusted_and_does_not_drift(slab: tuple[Dataset, Resul
     assert np.abs(tilt).max() < 0.002
 
 
-@pytest.mark.xfail(reason="noise in the map's gradient passes for relief that holds x and y")
 def test_flat_plane_names_all_that_is_open(slab: tuple[Dataset, Result]) -> None:
     _, result = slab
     for frame in (1, 2, 3, 4):

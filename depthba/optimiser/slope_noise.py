@@ -1,0 +1,134 @@
+"""What noise in the map's slope adds to the reduced matrix, and how to take it off again.
+
+The pose Jacobian holds the map's gradient. The estimated map is noisy, so its gradient is never
+zero: on a bare plane the normal equations claim to know a shift along it. The expectation of what
+noise adds is found by drawing a map of nothing but noise, as the points would give it, and
+eliminating it like the true one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from depthba.optimiser import eliminate, kernels
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.linearise import (
+    Footprint,
+    Linearisation,
+    Loss,
+    State,
+    Workers,
+    fronts_of,
+    robust_sigma,
+)
+from depthba.optimiser.problem import Problem
+
+# Where noise adds less than this share in every direction, it is not worth the solves.
+SLIGHT = 0.02
+# What the data say counts as far as it exceeds this many times what noise alone would: what noise
+# truly put in scatters about what a draw of it would have.
+MARGIN = 2.0
+
+
+def without_slope_noise(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    lin: Linearisation,
+    S: NDArray[np.float64],
+    held: NDArray[np.float64],
+    free: NDArray[np.bool_],
+    workers: Workers,
+) -> NDArray[np.float64]:
+    """Return the exact reduced matrix S (6N, 6N) less what noise in the map's slope put into it.
+
+    Args:
+        problem: the points.
+        grid: where the nodes stand.
+        state: the solution.
+        loss: the residual.
+        lin: its linearisation.
+        S: (6N, 6N) exact reduced matrix.
+        held: (6N, 6N) what the measured poses add to S: the share of the noise counts against both.
+        free: (N,) frames that moved.
+        workers: the threads.
+    """
+    variance = robust_sigma(lin.residuals) ** 2
+    noisy = _noise_linearisation(problem, grid, state, loss, lin, workers)
+    n = len(free)
+    bound = np.zeros_like(S)
+    for i in range(n):
+        bound[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = variance * noisy.A[i]
+    keep = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
+    if not free.any() or _largest_share(bound[keep], (S + held)[keep]) < SLIGHT:
+        return S
+    out = S.copy()
+    noise = variance * eliminate.exact(noisy, workers, 1e-3)
+    out[keep] = _less(S[keep], MARGIN * noise[keep], held[keep])
+    return out
+
+
+def _largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+    floor = 1e-12 * np.max(np.diag(whole), initial=1e-300)
+    return float(eigh(part, whole + floor * np.eye(len(whole)), eigvals_only=True)[-1])
+
+
+def _less(
+    S: NDArray[np.float64], noise: NDArray[np.float64], held: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return ``S - noise`` with what would fall below nothing in units of ``S + held`` set to 0."""
+    whole = S + held + 1e-12 * np.max(np.diag(S), initial=1e-300) * np.eye(len(S))
+    values, vectors = eigh(S - noise, whole)
+    back = whole @ vectors
+    return np.asarray((back * np.maximum(values, 0.0)) @ back.T)
+
+
+def _noise_linearisation(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    loss: Loss,
+    lin: Linearisation,
+    workers: Workers,
+) -> Linearisation:
+    """Normal equations whose Jacobians hold the gradient of a map drawn from unit noise alone."""
+    nodes = np.empty((*grid.shape, 3))
+    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
+    fronts = fronts_of(problem, state.T_map_camera)
+    rng = np.random.default_rng(0)
+    draws = [rng.standard_normal(len(f)) for f in problem.frames]
+    count = len(problem.frames)
+    poses = [(T[:3, :3].copy(), T[:3, 3].copy()) for T in state.T_map_camera]
+
+    def drawn(i: int) -> NDArray[np.float64]:
+        field = np.zeros(grid.shape)
+        kernels.noise_gradient(
+            problem.frames[i].points, *poses[i], grid.origin, grid.spacing, nodes,
+            loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i], draws[i], field,
+        )  # fmt: skip
+        return field
+
+    total = np.zeros(grid.shape)
+    for i in range(count):
+        total += drawn(i)
+    heights, _ = lin.C.solve(-total, 1e-4)
+    noise = np.empty((*grid.shape, 3))
+    kernels.nodal_gradients(heights, grid.spacing, noise)
+    A = np.zeros((count, 6, 6))
+    B = tuple(Footprint(f.y, f.x, np.zeros_like(f.values)) for f in lin.B)
+
+    def filled(i: int) -> None:
+        kernels.slope_noise(
+            problem.frames[i].points, *poses[i], poses[i][1] - lin.pivots[i], grid.origin,
+            grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i],
+            noise, A[i], B[i].values, B[i].x, B[i].y,
+        )  # fmt: skip
+
+    workers.map(filled, range(count))
+    A += np.tril(A, -1).transpose(0, 2, 1)
+    return replace(lin, A=A, B=B)
