@@ -40,10 +40,6 @@ GAIN = 0.02
 # Where the estimate owes the measured poses less than this in every direction, their exact weight
 # is of no account.
 NEGLIGIBLE = 0.002
-# Most times that the last level is solved with a new weight of the measured poses, and the share by
-# which that must have changed.
-ROUNDS = 4
-SAME = 0.1
 
 
 @dataclass
@@ -138,6 +134,12 @@ def _register(
                 gain=0.0 if last else GAIN,
             )
             temperature = 0.0
+            if preset.prior:
+                if known is None or known.owed > NEGLIGIBLE:
+                    known = certainty.correlation(
+                        level.problem, level.grid, state, level.loss, lin, prior, free, workers
+                    )
+                temperature = known.inflation * robust_sigma(lin.residuals) ** 2
 
             def report(
                 p: Progress, level: Level = level, index: int = index, phase: str = phase
@@ -149,24 +151,11 @@ def _register(
                 )
                 callback(history[-1])
 
-            # The prior's weight hangs on the residuals, and they on it: at the end, until it stays.
-            for _ in range(ROUNDS if last and preset.prior else 1):
-                if preset.prior:
-                    if known is None or known.owed > NEGLIGIBLE:
-                        known = certainty.correlation(
-                            level.problem, level.grid, state, level.loss, lin, prior, free, workers
-                        )
-                    before = temperature
-                    temperature = known.inflation * robust_sigma(lin.residuals) ** 2
-                    if abs(temperature - before) < SAME * temperature:
-                        break
-                outcome = solve_level(
-                    level.problem, level.grid, state, level.loss, rules, acting, temperature,
-                    free, level.smooth, workers, report,
-                )  # fmt: skip
-                state, lin = outcome.state, outcome.lin
-                if known is not None and known.owed <= NEGLIGIBLE:
-                    break
+            outcome = solve_level(
+                level.problem, level.grid, state, level.loss, rules, acting, temperature,
+                free, level.smooth, workers, report,
+            )  # fmt: skip
+            state, lin = outcome.state, outcome.lin
             clock.lap(f"level {index} {phase}")
         poses, heights, previous = state.T_map_camera, state.heights, level.grid
 
