@@ -44,13 +44,6 @@ class Shot:
     @cached_property
     def cosine(self) -> Image:
         """(height, width) of the angle between viewing ray and surface normal; 1 at a miss."""
-        camera = self.sensor.camera
-        x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
-        y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
-        # Turned into the camera's axes by triangle, of which there are fewer than pixels.
-        turned = np.einsum("ij,jk->ik", self.scene.normals, self.T_world_camera[:3, :3])
-        n = turned.astype(np.float32)[self.hits.triangle]
-        towards = n[..., 0] * x + n[..., 1] * y + n[..., 2]
-        cosine = np.abs(towards) / np.sqrt(x * x + y * y + np.float32(1.0))
+        cosine = self.scene.incidence(self.sensor.camera, self.T_world_camera, self.hits)
         cosine[self.hits.triangle < 0] = 1.0
-        return np.asarray(np.minimum(cosine, np.float32(1.0)))
+        return np.minimum(cosine, 1.0).astype(np.float32)
