@@ -22,19 +22,32 @@ LATERAL = 0.05
 # |n.u| below this is a grazing ray: the walk along it is not to be trusted, so its length is
 # bounded.
 GRAZING = 0.3
+# A first step along the ray below this share of a cell needs no second.
+SHORT = 0.5
 
 
 @nb.njit(cache=True, nogil=True)
 def nodal_gradients(heights, spacing, nodes):
     """Fill ``nodes`` (ny, nx, 3) with heights and central differences, one-sided at the border."""
+    nodal_rows(heights, spacing, nodes, 0, heights.shape[0])
+
+
+@nb.njit(cache=True, nogil=True)
+def nodal_rows(heights, spacing, nodes, first, last):
+    """Do what :func:`nodal_gradients` does, for the rows ``first`` to ``last`` alone."""
     ny, nx = heights.shape
-    for y in range(ny):
+    for y in range(first, last):
         y0, y1 = max(y - 1, 0), min(y + 1, ny - 1)
-        for x in range(nx):
+        across, along = 1.0 / ((y1 - y0) * spacing), 0.5 / spacing
+        for x in range(1, nx - 1):
+            nodes[y, x, 0] = heights[y, x]
+            nodes[y, x, 1] = (heights[y, x + 1] - heights[y, x - 1]) * along
+            nodes[y, x, 2] = (heights[y1, x] - heights[y0, x]) * across
+        for x in (0, nx - 1):
             x0, x1 = max(x - 1, 0), min(x + 1, nx - 1)
             nodes[y, x, 0] = heights[y, x]
             nodes[y, x, 1] = (heights[y, x1] - heights[y, x0]) / ((x1 - x0) * spacing)
-            nodes[y, x, 2] = (heights[y1, x] - heights[y0, x]) / ((y1 - y0) * spacing)
+            nodes[y, x, 2] = (heights[y1, x] - heights[y0, x]) * across
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
@@ -49,56 +62,76 @@ def _read(nodes, x, y, a, b):
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _residual(px, py, pz, R, t, origin, spacing, nodes, along_ray, slope, front, cap):
+def _scalars(R, t, origin, spacing):
+    """Rotation, height and grid position of the sensor as scalars, which stay in registers."""
+    inverse = 1.0 / spacing
+    return (
+        R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2],
+        t[2], (t[0] - origin[0]) * inverse, (t[1] - origin[1]) * inverse, inverse,
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _inside(nodes, bx, by, width, height):
+    """First and last cell in x and y on which a footprint and central differences stand."""
+    return (
+        max(bx, 1), min(bx + width - 2, nodes.shape[1] - 3),
+        max(by, 1), min(by + height - 2, nodes.shape[0] - 3),
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _residual(px, py, pz, pose, cells, nodes, along_ray, slope, front, cap):
     """Residual of one point.
 
-    Returns: on the map?, cell x, y, fractions a, b, the point (3 values) relative to t, residual,
-    norm, gx, gy. ``residual / norm`` is the signed distance in metres. Along the ray it is taken at
-    the foot, where the viewing ray meets the map (two Newton steps): a residual read at the noisy
-    point itself correlates with the map's gradient there, a bias that grows with its variance.
+    Returns: on the map?, cell x, y, fractions a, b, the point (3 values) relative to the sensor's
+    centre, residual, squared norm, gx, gy. ``residual / norm`` is the signed distance in metres.
+    Along the ray it is taken at the foot, where the viewing ray meets the map (Newton steps; the
+    second only where the first was long): a residual read at the noisy point itself correlates with
+    the map's gradient there, a bias that grows with its variance.
     """
-    ny, nx = nodes.shape[0], nodes.shape[1]
-    qx = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
-    qy = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
-    qz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
-    cx, cy = (qx + t[0] - origin[0]) / spacing, (qy + t[1] - origin[1]) / spacing
-    x, y = int(np.floor(cx)), int(np.floor(cy))
-    on = x >= 1 and y >= 1 and x < nx - 2 and y < ny - 2
-    ux, uy, uz, walked = 0.0, 0.0, 1.0, 0.0
-    d, gx, gy = 0.0, 0.0, 0.0
-    fx, fy, fz = qx, qy, qz
-    if on and along_ray:
-        length = np.sqrt(qx * qx + qy * qy + qz * qz)
-        ux, uy, uz = qx / length, qy / length, qz / length
-        for _ in range(2):
-            d, gx, gy = _read(nodes, x, y, cx - x, cy - y)
-            nu = front * (uz - gx * ux - gy * uy)
-            # a surface seen from behind or at a grazing angle: walk no further than a bounded slope
-            # allows
-            nu = front * max(nu, GRAZING)
-            step = (fz + t[2] - d) / nu
-            walked = min(max(walked + step, -cap), cap)
-            fx, fy, fz = qx - walked * ux, qy - walked * uy, qz - walked * uz
-            cx, cy = (fx + t[0] - origin[0]) / spacing, (fy + t[1] - origin[1]) / spacing
-            x, y = int(np.floor(cx)), int(np.floor(cy))
-            on = x >= 1 and y >= 1 and x < nx - 2 and y < ny - 2
-            if not on:
-                break
-    r, norm = 0.0, 1.0
+    r00, r01, r02, r10, r11, r12, r20, r21, r22, tz, ox, oy, inverse = pose
+    x_low, x_high, y_low, y_high = cells
+    qx = r00 * px + r01 * py + r02 * pz
+    qy = r10 * px + r11 * py + r12 * pz
+    qz = r20 * px + r21 * py + r22 * pz
+    cx, cy = qx * inverse + ox, qy * inverse + oy
+    # truncation is floor for all that lies on the map
+    x, y = int(cx), int(cy)
+    on = x >= x_low and y >= y_low and x <= x_high and y <= y_high
+    r, norm2, gx, gy = 0.0, 1.0, 0.0, 0.0
     if on:
         d, gx, gy = _read(nodes, x, y, cx - x, cy - y)
-        r = fz + t[2] - d
-        n2 = 1.0 + gx * gx + gy * gy
+        r = qz + tz - d
         if along_ray:
+            shorter = 1.0 / np.sqrt(qx * qx + qy * qy + qz * qz)
+            ux, uy, uz = qx * shorter, qy * shorter, qz * shorter
+            walked = 0.0
+            for _ in range(2):
+                # a surface seen from behind or at a grazing angle: walk no further than a bounded
+                # slope allows
+                nu = front * max(front * (uz - gx * ux - gy * uy), GRAZING)
+                to = min(max(walked + r / nu, -cap), cap)
+                step, walked = to - walked, to
+                qx, qy, qz = qx - step * ux, qy - step * uy, qz - step * uz
+                cx, cy = qx * inverse + ox, qy * inverse + oy
+                x, y = int(cx), int(cy)
+                on = x >= x_low and y >= y_low and x <= x_high and y <= y_high
+                if not on:
+                    break
+                d, gx, gy = _read(nodes, x, y, cx - x, cy - y)
+                r = qz + tz - d
+                if abs(step) * inverse < SHORT:
+                    break
             nu = uz - gx * ux - gy * uy
             r += walked * nu
-            norm = np.sqrt(nu * nu + LATERAL * n2)
+            norm2 = nu * nu + LATERAL * (1.0 + gx * gx + gy * gy)
         elif slope:
-            norm = np.sqrt(n2)
-    return on, x, y, cx - x, cy - y, fx, fy, fz, r, norm, gx, gy
+            norm2 = 1.0 + gx * gx + gy * gy
+    return on, x, y, cx - x, cy - y, qx, qy, qz, r, norm2, gx, gy
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "arcp"})
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
 def accumulate(
     points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
     robust_c, judged_c, charge,
@@ -117,25 +150,27 @@ def accumulate(
     """
     cost, judged, used = 0.0, 0.0, 0
     c2, j2 = robust_c * robust_c, judged_c * judged_c
-    j = np.zeros(6)
-    height, width = B.shape[0], B.shape[1]
+    pose = _scalars(R, t, origin, spacing)
+    cells = _inside(nodes, bx, by, B.shape[1], B.shape[0])
+    arm0, arm1, arm2 = arm[0], arm[1], arm[2]
+    # sums in scalars stay in registers: an array would be stored at every point
+    a00 = a10 = a11 = a20 = a21 = a22 = a30 = a31 = a32 = a33 = 0.0
+    a40 = a41 = a42 = a43 = a44 = a50 = a51 = a52 = a53 = a54 = a55 = 0.0
+    g0 = g1 = g2 = g3 = g4 = g5 = 0.0
     for k in range(points.shape[0]):
-        own = points[k, 3]
-        share = points[k, 4]
-        on, x, y, a, b, qx, qy, qz, r, norm, gx, gy = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+        own, share = np.float64(points[k, 3]), np.float64(points[k, 4])
+        on, x, y, a, b, qx, qy, qz, r, norm2, gx, gy = _residual(
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
             along_ray, slope, front, cap,
         )  # fmt: skip
-        on = on and x >= bx and y >= by and x + 1 < bx + width and y + 1 < by + height
         if not on or share <= 0.0:
             cost += share * charge
             judged += share * charge
             weights[k] = 0.0
             residuals[k] = np.nan
             continue
-        scale = own / norm
-        e = r * scale
-        e2 = e * e
+        scale2 = own * own / norm2
+        e2 = r * r * scale2
         psi = 1.0
         if c2 > 0.0:
             root = c2 / (c2 + e2)
@@ -143,47 +178,97 @@ def accumulate(
             cost += share * root * e2
         else:
             cost += share * e2
-        judged += share * (e2 * j2 / (j2 + e2) if j2 > 0.0 else e2)
+        if j2 != c2:
+            judged += share * (e2 * j2 / (j2 + e2) if j2 > 0.0 else e2)
         used += 1
         weights[k] = psi
-        residuals[k] = e
-        w = share * psi * scale * scale
-        lx, ly, lz = qx + arm[0], qy + arm[1], qz + arm[2]
-        j[0], j[1], j[2] = -gx, -gy, 1.0
-        j[3], j[4], j[5] = ly + lz * gy, -lz * gx - lx, -lx * gy + ly * gx
+        residuals[k] = r * np.sqrt(scale2)
+        w = share * psi * scale2
+        lx, ly, lz = qx + arm0, qy + arm1, qz + arm2
+        j3, j4, j5 = ly + lz * gy, -lz * gx - lx, -lx * gy + ly * gx
+        w0, w1, w3, w4, w5 = -w * gx, -w * gy, w * j3, w * j4, w * j5
+        a00 -= w0 * gx
+        a10 -= w1 * gx
+        a11 -= w1 * gy
+        a20 += w0
+        a21 += w1
+        a22 += w
+        a30 -= w3 * gx
+        a31 -= w3 * gy
+        a32 += w3
+        a33 += w3 * j3
+        a40 -= w4 * gx
+        a41 -= w4 * gy
+        a42 += w4
+        a43 += w4 * j3
+        a44 += w4 * j4
+        a50 -= w5 * gx
+        a51 -= w5 * gy
+        a52 += w5
+        a53 += w5 * j3
+        a54 += w5 * j4
+        a55 += w5 * j5
+        g0 += w0 * r
+        g1 += w1 * r
+        g2 += w * r
+        g3 += w3 * r
+        g4 += w4 * r
+        g5 += w5 * r
         h00, h10, h01, h11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        lower, upper = B[y - by], B[y + 1 - by]
-        for m in range(6):
-            wj = w * j[m]
-            g[m] += wj * r
-            for n in range(m + 1):
-                A[m, n] += wj * j[n]
-            lower[x - bx, m] -= wj * h00
-            lower[x + 1 - bx, m] -= wj * h10
-            upper[x - bx, m] -= wj * h01
-            upper[x + 1 - bx, m] -= wj * h11
-        s00, s10, s01, s11 = (
-            stencil[y, x],
-            stencil[y, x + 1],
-            stencil[y + 1, x],
-            stencil[y + 1, x + 1],
-        )
-        s00[0] += w * h00 * h00
-        s10[0] += w * h10 * h10
-        s01[0] += w * h01 * h01
-        s11[0] += w * h11 * h11
-        s00[1] += w * h00 * h10
-        s01[1] += w * h01 * h11
-        s00[2] += w * h00 * h01
-        s10[2] += w * h10 * h11
-        s00[3] += w * h00 * h11
-        s00[4] += w * h10 * h01
-        wr = w * r
-        s00[5] -= h00 * wr
-        s10[5] -= h10 * wr
-        s01[5] -= h01 * wr
-        s11[5] -= h11 * wr
-    return cost, judged, used
+        _couple(B[y - by, x - bx], h00, w0, w1, w, w3, w4, w5)
+        _couple(B[y - by, x + 1 - bx], h10, w0, w1, w, w3, w4, w5)
+        _couple(B[y + 1 - by, x - bx], h01, w0, w1, w, w3, w4, w5)
+        _couple(B[y + 1 - by, x + 1 - bx], h11, w0, w1, w, w3, w4, w5)
+        v00, v10, v01, v11 = w * h00, w * h10, w * h01, w * h11
+        node = stencil[y, x]
+        node[0] += v00 * h00
+        node[1] += v00 * h10
+        node[2] += v00 * h01
+        node[3] += v00 * h11
+        node[4] += v10 * h01
+        node[5] -= v00 * r
+        node = stencil[y, x + 1]
+        node[0] += v10 * h10
+        node[2] += v10 * h11
+        node[5] -= v10 * r
+        node = stencil[y + 1, x]
+        node[0] += v01 * h01
+        node[1] += v01 * h11
+        node[5] -= v01 * r
+        node = stencil[y + 1, x + 1]
+        node[0] += v11 * h11
+        node[5] -= v11 * r
+    rows = (
+        (a00, a10, a20, a30, a40, a50), (a10, a11, a21, a31, a41, a51),
+        (a20, a21, a22, a32, a42, a52), (a30, a31, a32, a33, a43, a53),
+        (a40, a41, a42, a43, a44, a54), (a50, a51, a52, a53, a54, a55),
+    )  # fmt: skip
+    sums = (g0, g1, g2, g3, g4, g5)
+    for m in range(6):
+        g[m] += sums[m]
+        for n in range(6):
+            A[m, n] += rows[m][n]
+    return cost, (cost if j2 == c2 else judged), used
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _couple(node, h, w0, w1, w2, w3, w4, w5):
+    """Subtract a point's weighted Jacobian, times its share ``h`` of a node, from the coupling."""
+    node[0] -= h * w0
+    node[1] -= h * w1
+    node[2] -= h * w2
+    node[3] -= h * w3
+    node[4] -= h * w4
+    node[5] -= h * w5
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _apart(field, x, y, a, b, value):
+    """Subtract a value from the four nodes of a cell by their shares."""
+    field[y, x] -= (1 - a) * (1 - b) * value
+    field[y, x + 1] -= a * (1 - b) * value
+    field[y + 1, x] -= (1 - a) * b * value
+    field[y + 1, x + 1] -= a * b * value
 
 
 @nb.njit(cache=True, nogil=True)
@@ -192,17 +277,18 @@ def block_gradient(
     weights, members, g, gradient,
 ):  # fmt: skip
     """Add what the points ``members`` contribute to ``g`` (6,) and to ``gradient`` (ny, nx)."""
+    pose = _scalars(R, t, origin, spacing)
+    cells = _inside(nodes, 0, 0, nodes.shape[1], nodes.shape[0])
     for k in members:
         if weights[k] <= 0.0:
             continue
-        on, x, y, a, b, qx, qy, qz, r, norm, gx, gy = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+        on, x, y, a, b, qx, qy, qz, r, norm2, gx, gy = _residual(
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
             along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue
-        scale = points[k, 3] / norm
-        wr = points[k, 4] * weights[k] * scale * scale * r
+        wr = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2 * r
         lx, ly, lz = qx + arm[0], qy + arm[1], qz + arm[2]
         g[0] -= wr * gx
         g[1] -= wr * gy
@@ -210,10 +296,7 @@ def block_gradient(
         g[3] += wr * (ly + lz * gy)
         g[4] += wr * (-lz * gx - lx)
         g[5] += wr * (-lx * gy + ly * gx)
-        gradient[y, x] -= (1 - a) * (1 - b) * wr
-        gradient[y, x + 1] -= a * (1 - b) * wr
-        gradient[y + 1, x] -= (1 - a) * b * wr
-        gradient[y + 1, x + 1] -= a * b * wr
+        _apart(gradient, x, y, a, b, wr)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -221,20 +304,19 @@ def noise_gradient(
     points, R, t, origin, spacing, nodes, along_ray, slope, front, cap, weights, draws, gradient,
 ):  # fmt: skip
     """Add to ``gradient`` (ny, nx) what residuals ``draws`` (n,) times the points' sigma would."""
+    pose = _scalars(R, t, origin, spacing)
+    cells = _inside(nodes, 0, 0, nodes.shape[1], nodes.shape[0])
     for k in range(points.shape[0]):
         if weights[k] <= 0.0:
             continue
-        on, x, y, a, b, _, _, _, _, norm, _, _ = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+        on, x, y, a, b, _, _, _, _, norm2, _, _ = _residual(
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
             along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue
-        e = points[k, 4] * weights[k] * points[k, 3] / norm * draws[k]
-        gradient[y, x] -= (1 - a) * (1 - b) * e
-        gradient[y, x + 1] -= a * (1 - b) * e
-        gradient[y + 1, x] -= (1 - a) * b * e
-        gradient[y + 1, x + 1] -= a * b * e
+        e = points[k, 4] * weights[k] * points[k, 3] / np.sqrt(norm2) * draws[k]
+        _apart(gradient, x, y, a, b, e)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -248,32 +330,31 @@ def slope_noise(
     :func:`accumulate`. Only the lower triangle of ``A`` is filled.
     """
     j = np.zeros(6)
-    height, width = B.shape[0], B.shape[1]
+    pose = _scalars(R, t, origin, spacing)
+    cells = _inside(nodes, bx, by, B.shape[1], B.shape[0])
     for k in range(points.shape[0]):
         if weights[k] <= 0.0:
             continue
-        on, x, y, a, b, qx, qy, qz, _, norm, _, _ = _residual(
-            points[k, 0], points[k, 1], points[k, 2], R, t, origin, spacing, nodes,
+        on, x, y, a, b, qx, qy, qz, _, norm2, _, _ = _residual(
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
             along_ray, slope, front, cap,
         )  # fmt: skip
-        if not (on and x >= bx and y >= by and x + 1 < bx + width and y + 1 < by + height):
+        if not on:
             continue
-        scale = points[k, 3] / norm
-        w = points[k, 4] * weights[k] * scale * scale
+        w = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2
         _, gx, gy = _read(noise, x, y, a, b)
         lx, ly, lz = qx + arm[0], qy + arm[1], qz + arm[2]
         j[0], j[1], j[2] = -gx, -gy, 0.0
         j[3], j[4], j[5] = lz * gy, -lz * gx, -lx * gy + ly * gx
-        h00, h10, h01, h11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        lower, upper = B[y - by], B[y + 1 - by]
         for m in range(6):
-            wj = w * j[m]
             for n in range(m + 1):
-                A[m, n] += wj * j[n]
-            lower[x - bx, m] -= wj * h00
-            lower[x + 1 - bx, m] -= wj * h10
-            upper[x - bx, m] -= wj * h01
-            upper[x + 1 - bx, m] -= wj * h11
+                A[m, n] += w * j[m] * j[n]
+        h00, h10, h01, h11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+        w0, w1, w3, w4, w5 = w * j[0], w * j[1], w * j[3], w * j[4], w * j[5]
+        _couple(B[y - by, x - bx], h00, w0, w1, 0.0, w3, w4, w5)
+        _couple(B[y - by, x + 1 - bx], h10, w0, w1, 0.0, w3, w4, w5)
+        _couple(B[y + 1 - by, x - bx], h01, w0, w1, 0.0, w3, w4, w5)
+        _couple(B[y + 1 - by, x + 1 - bx], h11, w0, w1, 0.0, w3, w4, w5)
 
 
 @nb.njit(cache=True, nogil=True)

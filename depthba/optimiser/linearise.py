@@ -5,11 +5,9 @@ One pass over all points fills the normal equations of poses and map together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +15,7 @@ from depthba.optimiser import kernels
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.stencil import Stencil
-
-T = TypeVar("T")
+from depthba.optimiser.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,8 @@ class Footprint:
     y: int
     x: int
     values: NDArray[np.float64]
+    memory: NDArray[np.float64] | None = None
+    """What ``values`` is laid out in, with some room to spare."""
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -91,41 +90,6 @@ class Linearisation:
     """(N, 3), map frame, about which the poses are perturbed."""
 
 
-class Workers:
-    """A few threads over which frames are dealt out.
-
-    Sums are formed in a fixed order, whatever finishes first.
-    """
-
-    def __init__(self, threads: int) -> None:
-        self.threads = threads
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
-
-    def map(self, function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
-        """Return the results in the order of the items."""
-        if self._pool is None:
-            return list(map(function, *items))
-        return list(self._pool.map(function, *items))
-
-    def close(self) -> None:
-        """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def shares(self, problem: Problem) -> list[range]:
-        """Deal the frames out in runs of about equal numbers of points."""
-        sizes = np.array([len(f) for f in problem.frames], dtype=float)
-        ends = np.cumsum(sizes) - sizes / 2
-        share = np.minimum(
-            (ends / max(sizes.sum(), 1) * self.threads).astype(int), self.threads - 1
-        )
-        return [
-            range(int(np.flatnonzero(share == k)[0]), int(np.flatnonzero(share == k)[-1]) + 1)
-            for k in range(self.threads)
-            if (share == k).any()
-        ]
-
-
 def pivots_of(problem: Problem, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return each frame's centroid in the map frame, (N, 3)."""
     return np.stack(
@@ -153,6 +117,7 @@ def linearise(
     workers: Workers,
     smooth: NDArray[np.bool_],
     judge: Loss | None = None,
+    spare: Linearisation | None = None,
 ) -> Linearisation:
     """Fill the normal equations at ``state``.
 
@@ -164,48 +129,60 @@ def linearise(
         workers: the threads.
         smooth: (ny, nx) nodes that the smoothing term ties to their neighbours.
         judge: the loss of the linearisation to compare the cost with; None: the same.
+        spare: a linearisation of the same points on the same grid that nobody reads any more: its
+            arrays are overwritten, which saves fetching fresh memory at every step.
     """
-    nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
+    if spare is not None and spare.C.own.shape != grid.shape:
+        spare = None
+    count = len(problem.frames)
+    judge = judge or loss
     pivots = pivots_of(problem, state.T_map_camera)
     fronts = fronts_of(problem, state.T_map_camera)
-    count = len(problem.frames)
     A, g = np.zeros((count, 6, 6)), np.zeros((count, 6))
     costs = np.zeros((count, 3))
-    weights = tuple(np.empty(len(f), np.float32) for f in problem.frames)
-    residuals = tuple(np.empty(len(f), np.float32) for f in problem.frames)
-    judge = judge or loss
-    B: list[Footprint] = [
-        _empty_footprint(f, T, grid, loss)
-        for f, T in zip(problem.frames, state.T_map_camera, strict=True)
-    ]
+    if spare is None:
+        weights = tuple(np.empty(len(f), np.float32) for f in problem.frames)
+        residuals = tuple(np.empty(len(f), np.float32) for f in problem.frames)
+    else:
+        weights, residuals = spare.weights, spare.residuals
+    B = tuple(
+        _footprint(f, T, grid, loss, None if spare is None else spare.B[i])
+        for i, (f, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True))
+    )
+    shares = workers.shares(problem)
+    scratch = workers.scratch(grid.shape, len(shares))
+    bands = workers.bands(grid.shape[0])
 
-    def share(frames: range) -> NDArray[np.float64]:
-        total = np.zeros((*grid.shape, 6))
+    def nodes_of(band: tuple[int, int]) -> None:
+        kernels.nodal_rows(state.heights, grid.spacing, scratch.nodes, *band)
+
+    def share(frames: range, total: NDArray[np.float64]) -> None:
+        total.fill(0.0)
         for i in frames:
+            B[i].values.fill(0.0)
             pose = state.T_map_camera[i]
             costs[i] = kernels.accumulate(
                 problem.frames[i].points, pose[:3, :3].copy(), pose[:3, 3].copy(),
-                pose[:3, 3] - pivots[i], grid.origin, grid.spacing, nodes,
+                pose[:3, 3] - pivots[i], grid.origin, grid.spacing, scratch.nodes,
                 loss.along_ray, loss.slope, fronts[i], loss.cap, loss.robust_c, judge.robust_c,
                 judge.charge, weights[i], residuals[i], total,
                 A[i], g[i], B[i].values, B[i].x, B[i].y,
             )  # fmt: skip
-        return total
 
-    totals = workers.map(share, workers.shares(problem))
-    stencil = totals[0]
-    for other in totals[1:]:
-        stencil += other
-    A += np.tril(A, -1).transpose(0, 2, 1)
-    C = Stencil(*(np.ascontiguousarray(stencil[..., k]) for k in range(5)))
-    g_map = np.ascontiguousarray(stencil[..., 5])
-    smoothing = _add_smoothing(C, g_map, state.heights, loss.smoothing, smooth)
-    # nodes that nothing touches stay what they are
-    C.own[C.own <= 0.0] = 1.0
+    workers.map(nodes_of, bands)
+    workers.map(share, shares, scratch.totals)
+    C = Stencil.empty(grid.shape) if spare is None else spare.C
+    g_map = np.empty(grid.shape) if spare is None else spare.g_map
+    rough = workers.map(
+        lambda band: collect(
+            scratch.totals, state.heights, smooth, loss.smoothing, *band,
+            C.own, C.right, C.up, C.up_right, C.up_left, g_map,
+        ),
+        bands,
+    )  # fmt: skip
     return Linearisation(
-        A, g, tuple(B), C, g_map,
-        float(costs[:, 0].sum()) + smoothing, float(costs[:, 1].sum()) + smoothing,
+        A, g, B, C, g_map,
+        float(costs[:, 0].sum()) + sum(rough), float(costs[:, 1].sum()) + sum(rough),
         int(costs[:, 2].sum()),
         weights, residuals, pivots,
     )  # fmt: skip
@@ -218,40 +195,74 @@ def robust_sigma(residuals: tuple[NDArray[np.float32], ...]) -> float:
     return float(1.4826 * np.median(np.abs(some))) if len(some) else 0.0
 
 
-def _empty_footprint(
-    frame: FramePoints, T: NDArray[np.float64], grid: Grid, loss: Loss
+def _footprint(
+    frame: FramePoints,
+    T: NDArray[np.float64],
+    grid: Grid,
+    loss: Loss,
+    spare: Footprint | None,
 ) -> Footprint:
+    """Return a footprint with room for all that the frame can touch; its values are not set."""
     q = frame.hull @ T[:2, :3].T + T[:2, 3]
     reach = 2 + int(np.ceil(loss.cap / grid.spacing)) if loss.along_ray else 2
     low = np.floor((q.min(axis=0) - grid.origin) / grid.spacing).astype(int) - reach
     high = np.ceil((q.max(axis=0) - grid.origin) / grid.spacing).astype(int) + reach
     x0, y0 = np.clip(low, 0, [grid.shape[1] - 2, grid.shape[0] - 2])
     x1, y1 = np.clip(high, [x0 + 2, y0 + 2], [grid.shape[1], grid.shape[0]])
-    return Footprint(int(y0), int(x0), np.zeros((y1 - y0, x1 - x0, 6)))
+    shape = (int(y1 - y0), int(x1 - x0), 6)
+    memory = None if spare is None else spare.memory
+    if memory is None or memory.size < np.prod(shape):
+        # room to grow by a few nodes each way as the pose moves
+        memory = np.empty((shape[0] + 8) * (shape[1] + 8) * 6)
+    return Footprint(int(y0), int(x0), memory[: int(np.prod(shape))].reshape(shape), memory)
 
 
-def _add_smoothing(
-    C: Stencil,
-    g: NDArray[np.float64],
-    heights: NDArray[np.float64],
-    weight: float,
-    smooth: NDArray[np.bool_],
-) -> float:
-    """Add ``weight * (difference of neighbouring heights)^2`` to the map's block.
+@nb.njit(cache=True, nogil=True)
+def collect(
+    totals, heights, smooth, weight, first, last, own, right, up, up_right, up_left, gradient
+):  # type: ignore[no-untyped-def]
+    """Sum the threads' stencils ``totals`` (threads, ny, nx, 6) over the rows ``first`` to ``last``.
 
-    Return that cost.
+    Adds the smoothing term, ``weight`` times the squared difference of neighbouring heights where
+    both are ``smooth``, and returns its cost. Nodes that nothing touches stay what they are: they
+    get a diagonal of 1.
     """
-    along_x = weight * (smooth[:, :-1] & smooth[:, 1:])
-    along_y = weight * (smooth[:-1] & smooth[1:])
-    dx, dy = np.diff(heights, axis=1), np.diff(heights, axis=0)
-    C.own[:, 1:] += along_x
-    C.own[:, :-1] += along_x
-    C.own[1:] += along_y
-    C.own[:-1] += along_y
-    C.right[:, :-1] -= along_x
-    C.up[:-1] -= along_y
-    g[:, 1:] += along_x * dx
-    g[:, :-1] -= along_x * dx
-    g[1:] += along_y * dy
-    g[:-1] -= along_y * dy
-    return float((along_x * dx**2).sum() + (along_y * dy**2).sum())
+    ny, nx = heights.shape
+    cost = 0.0
+    for y in range(first, last):
+        for x in range(nx):
+            o, r, u, d, a, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(totals.shape[0]):
+                node = totals[k, y, x]
+                o += node[0]
+                r += node[1]
+                u += node[2]
+                d += node[3]
+                a += node[4]
+                g += node[5]
+            if smooth[y, x]:
+                if x + 1 < nx and smooth[y, x + 1]:
+                    e = heights[y, x] - heights[y, x + 1]
+                    o += weight
+                    r -= weight
+                    g += weight * e
+                    cost += weight * e * e
+                if y + 1 < ny and smooth[y + 1, x]:
+                    e = heights[y, x] - heights[y + 1, x]
+                    o += weight
+                    u -= weight
+                    g += weight * e
+                    cost += weight * e * e
+                if x > 0 and smooth[y, x - 1]:
+                    o += weight
+                    g += weight * (heights[y, x] - heights[y, x - 1])
+                if y > 0 and smooth[y - 1, x]:
+                    o += weight
+                    g += weight * (heights[y, x] - heights[y - 1, x])
+            own[y, x] = o if o > 0.0 else 1.0
+            right[y, x] = r
+            up[y, x] = u
+            up_right[y, x] = d
+            up_left[y, x] = a
+            gradient[y, x] = g
+    return cost

@@ -35,6 +35,11 @@ class Stencil:
     up_left: Field
     """Coupling of (y, x + 1) with (y + 1, x)."""
 
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> Stencil:
+        """Return a matrix whose values are not set."""
+        return cls(*(np.empty(shape) for _ in range(5)))
+
     def times(self, v: Field) -> Field:
         """Return the product with a field (ny, nx)."""
         out = np.empty_like(v)

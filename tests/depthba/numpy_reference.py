@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-LATERAL, GRAZING = 0.05, 0.3
+LATERAL, GRAZING, SHORT = 0.05, 0.3, 0.5
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,10 @@ def vertical(p: Floats, T: Floats, pivot: Floats, D: Map, slope: bool = False) -
 def ranged(
     p: Floats, T: Floats, pivot: Floats, D: Map, front: float, cap: float
 ) -> Residual | None:
-    """Return the residual along the viewing ray: two Newton steps to the foot, all taken there."""
+    """Return the residual along the viewing ray: Newton steps to the foot, all taken there.
+
+    The second only where the first was long.
+    """
     q = T[:3, :3] @ p + T[:3, 3]
     u = T[:3, :3] @ p / np.linalg.norm(p)
     walked, foot = 0.0, q
@@ -96,8 +99,11 @@ def ranged(
             return None
         height, n = D.read(cell)
         guarded = front * max(front * (n @ u), GRAZING)
+        before = walked
         walked = float(np.clip(walked + (foot[2] - height) / guarded, -cap, cap))
         foot = q - walked * u
+        if abs(walked - before) < SHORT * D.spacing:
+            break
     cell = D.cell(foot[:2])
     if cell is None:
         return None
