@@ -19,7 +19,9 @@ from depthba.dataset import Dataset
 from depthba.errors import OptionError, RunError
 from depthba.picture import CELL_SPACINGS
 from depthba.run_folder import Run
-from eval.metrics import Metric, consistency, pose_metrics, start
+from eval.bound import Bound
+from eval.bound import bound as cramer_rao
+from eval.metrics import Metric, consistency, over_bound, pose_metrics, start
 from eval.review import RECORDING
 from eval.self_consistency import agreement, map_rotation
 
@@ -47,6 +49,8 @@ class Evaluation:
     """Overlapping pairs of frames, at the estimate."""
     nees_dof: int | None
     """Degrees of freedom behind the consistency figure; None without truth or covariance."""
+    bound: Bound | None
+    """The least error that the noise allows; None where it was not asked for."""
     seconds: float
     """That the judging took."""
 
@@ -56,6 +60,7 @@ def evaluate(
     dataset: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
+    bound: bool = False,
 ) -> list[Metric]:
     """Judge a run and leave metrics.json and report.md in its folder.
 
@@ -64,17 +69,18 @@ def evaluate(
         dataset: the dataset's folder; None: the one that the run remembers.
         truth: a file of true poses, TUM; None: the dataset's own, if it has any.
         cell: edge of the cells in which frames are compared, m; None: four point spacings.
+        bound: whether to compute the Cramér-Rao bound too, and the errors over it.
 
     Returns:
         The metrics of the estimate, then those of the start poses, named ``start_...``.
 
     Raises:
         RunError: the run or its dataset is missing, or they do not belong together.
-        DatasetError: the dataset or the truth is wrong.
+        DatasetError: the dataset or the truth is wrong, or says too little for a bound.
         OptionError: ``cell`` makes no sense.
 
     """
-    judged = save(run, dataset, truth, cell)
+    judged = save(run, dataset, truth, cell, bound)
     return [*judged.metrics, *start(judged.start_metrics)]
 
 
@@ -83,6 +89,7 @@ def save(
     dataset: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
+    bound: bool = False,
 ) -> Evaluation:
     """Judge a run and leave metrics.json and report.md in its folder; see `evaluate`.
 
@@ -90,7 +97,7 @@ def save(
     """
     from eval.report import report  # which needs this module's types
 
-    judged = judge(run, dataset, truth, cell)
+    judged = judge(run, dataset, truth, cell, bound)
     durable.write_json(judged.run.path / "metrics.json", as_json(judged))
     durable.write_text(judged.run.path / "report.md", report(judged))
     recording = judged.run.path / RECORDING
@@ -107,6 +114,7 @@ def judge(
     dataset: str | os.PathLike[str] | None = None,
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
+    bound: bool = False,
 ) -> Evaluation:
     """Compute all figures of a run; see `evaluate`. Writes nothing."""
     began = time.perf_counter()
@@ -131,6 +139,10 @@ def judge(
             judged = consistency(T_est, T_true, opened.covariance)
             metrics.append(Metric("nees_per_dof", "1", "one", judged.nees_per_dof))
             dof = judged.dof
+    least = None
+    if bound:
+        least = _bound(data, rows, T_true, opened)
+        metrics += over_bound(metrics, least.translation, least.rotation)
 
     clouds = load_clouds(data, colours=False)
     points = [_within_range(data, clouds[k].points) for k in rows]
@@ -159,6 +171,7 @@ def judge(
         shared_cells=len(agreements[1].spread.shared),
         pairs=len(agreements[1].pairs),
         nees_dof=dof,
+        bound=least,
         seconds=time.perf_counter() - began,
     )
 
@@ -187,6 +200,9 @@ def as_json(judged: Evaluation) -> dict[str, Any]:
         "shared_cells": judged.shared_cells,
         "pairs": judged.pairs,
         "nees_dof": judged.nees_dof,
+        "bound": None
+        if judged.bound is None
+        else {k: getattr(judged.bound, k) for k in ("spacing", "sigma", "surface")},
         "seconds": judged.seconds,
     }
 
@@ -226,6 +242,26 @@ def _within_range(data: Dataset, points: Floats) -> Floats:
     low = 0.0 if sensor.depth_min is None else sensor.depth_min
     high = np.inf if sensor.depth_max is None else sensor.depth_max
     return points[(points[:, 2] > low) & (points[:, 2] < high)]
+
+
+def _bound(data: Dataset, rows: NDArray[np.int64], T_true: Floats | None, run: Run) -> Bound:
+    """Return the bound at the run's own map spacing and region of interest."""
+    if len(rows) != len(data):
+        raise RunError(
+            f"{run.path}: {len(rows)} of the {len(data)} frames in {data.path}; "
+            "the bound is for all of them"
+        )
+    roi = run.config.get("roi")
+    truth = None
+    if T_true is not None:
+        truth = np.empty_like(T_true)
+        truth[rows] = T_true
+    return cramer_rao(
+        data,
+        float(run.result["map"]["spacing"]),
+        roi=None if roi is None else tuple(roi),
+        truth=truth,
+    )
 
 
 def _truth(

@@ -153,6 +153,22 @@ def consistency(T_est: Floats, T_true: Floats, covariance: Floats) -> Consistenc
     return Consistency(total / dof if dof else float("nan"), dof)
 
 
+def over_bound(metrics: Sequence[Metric], translation: float, rotation: float) -> list[Metric]:
+    """Return the least mean absolute errors (m, rad) as metrics, and the errors over them."""
+    now = {m.name: m.value for m in metrics}
+    least: tuple[tuple[str, Unit, float], ...] = (
+        ("translation", "m", translation),
+        ("rotation", "rad", rotation),
+    )
+    return [
+        *(Metric(f"{name}_bound", unit, "lower", value) for name, unit, value in least),
+        *(
+            Metric(f"{name}_over_bound", "1", "lower", now[f"{name}_mae"] / value)
+            for name, _, value in least
+        ),
+    ]
+
+
 def start(metrics: Sequence[Metric]) -> list[Metric]:
     """Return the metrics renamed as those of the start poses."""
     return [Metric(f"{START}{m.name}", m.unit, m.better, m.value) for m in metrics]

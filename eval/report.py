@@ -22,6 +22,10 @@ NAMES = {
     "ate_rmse": "Trajectory after best alignment (ATE)",
     "rpe_translation_rmse": "Motion between frames, translation (RPE)",
     "rpe_rotation_rmse": "Motion between frames, rotation (RPE)",
+    "translation_bound": "Translation, least possible (Cramér-Rao bound)",
+    "rotation_bound": "Rotation, least possible (Cramér-Rao bound)",
+    "translation_over_bound": "Translation, error over the bound",
+    "rotation_over_bound": "Rotation, error over the bound",
     "nees_per_dof": "Error over stated covariance (NEES per degree of freedom)",
     "spread_median": "Disagreement of frames, median cell",
     "spread_p90": "Disagreement of frames, 90 % of cells",
@@ -40,6 +44,13 @@ SHORT_NAMES = {
     "nees_per_dof": "NEES (1 is honest)",
 }
 """The same for where there is little room."""
+
+SURFACES = {
+    "clean": "It knows the surface without noise.",
+    "noisy": "Its surface is fitted to the noisy frames at the true poses, "
+    "less what noise adds to the slopes.",
+}
+"""Where the bound takes the surface from."""
 
 MOST_LINES = 6
 """Of what is open or held, on a page with little room."""
@@ -165,6 +176,12 @@ def _explanation(judged: Evaluation) -> str:
         text += (
             f" NEES is over {judged.nees_dof} degrees of freedom: 1 is an honest covariance, "
             "above it is too sure of itself."
+        )
+    if judged.bound is not None:
+        text += (
+            " The bound is on the mean absolute error, with range noise of "
+            f"{_mm(judged.bound.sigma)} and a map of {_mm(judged.bound.spacing)} spacing. "
+            f"{SURFACES[judged.bound.surface]}"
         )
     return text
 

@@ -12,7 +12,7 @@ import tyro
 from depthba.verbs import DONE, WRONG_USAGE
 from depthba.verbs.output import note, print_json
 from eval.evaluate import Evaluation, as_json, save
-from eval.report import NAMES, VERDICTS, gain, show
+from eval.report import NAMES, SURFACES, VERDICTS, gain, show
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,9 @@ class Arguments:
     """File of true poses, TUM. None: poses_true.txt of the dataset, if it has one."""
     cell: float | None = None
     """Edge of the cells in which frames are compared, m. None: four point spacings."""
+    bound: bool = False
+    """Compute the Cramér-Rao bound too, at the run's map spacing, and the errors over it. Needs
+    true poses and a stated noise; takes seconds to minutes."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -41,7 +44,7 @@ def run(arguments: Arguments) -> int:
         return WRONG_USAGE
     judged = []
     for path in arguments.runs:
-        one = save(path, arguments.dataset, arguments.truth, arguments.cell)
+        one = save(path, arguments.dataset, arguments.truth, arguments.cell, arguments.bound)
         judged.append(one)
         if not arguments.json:
             _print(one)
@@ -70,5 +73,7 @@ def _print(judged: Evaluation) -> None:
         if name in now:
             first = show(before[name]) if name in before else ""
             table.add_row(words, first, show(now[name]), gain(before.get(name), now[name]))
+    if judged.bound is not None:
+        table.caption = f"{SURFACES[judged.bound.surface]}\n{table.caption}"
     # a pipe has no width of its own, and a table must not be cut there
     Console(width=None if sys.stdout.isatty() else 120).print(table)
