@@ -19,7 +19,8 @@ class Options:
     resolution: float | None = None
     """Finest map spacing, m. None: close to the spacing of the points (paper: four times that)."""
     init: str = "measured"
-    """Where to start: measured, identity, or a file of poses in TUM format."""
+    """Where to start: measured, identity, pairwise (each frame searched for in its neighbours, for
+    measured poses too far off to start from), or a file of poses in TUM format."""
     roi: tuple[float, float, float, float, float, float] | None = None
     """Region of interest xmin xmax ymin ymax zmin zmax in the map frame, m: points outside, at the
     start poses, are left out."""

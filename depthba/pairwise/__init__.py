@@ -1,5 +1,5 @@
 """Start poses from pairs of frames, for measured poses too far off to start from."""
 
-from depthba.pairwise.start import Pair, PairwiseStart, pairwise_poses
+from depthba.pairwise.start import Pair, PairwiseStart, dataset_poses, pairwise_poses
 
-__all__ = ["Pair", "PairwiseStart", "pairwise_poses"]
+__all__ = ["Pair", "PairwiseStart", "dataset_poses", "pairwise_poses"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from depthba.pairwise.raster import Lattice, Raster
+from depthba.pairwise.raster import Lattice
 
 # Neighbouring cells are not independent: this many count as one.
 ALIKE = 16.0
@@ -92,7 +92,7 @@ def evidence(r: NDArray[np.float32], shared: NDArray[np.float32]) -> NDArray[np.
 def peak(
     score: NDArray[np.float32], r: NDArray[np.float32], window: Window, cell: float
 ) -> Shift | None:
-    """Return the best shift of a window, to a fraction of a cell; None where no score is above 0."""
+    """Return the best shift of a window, to a part of a cell; None where no score is above 0."""
     score = np.pad(score, 1, constant_values=-np.inf)
     y, x = np.unravel_index(int(np.argmax(score)), score.shape)
     value = float(score[y, x])

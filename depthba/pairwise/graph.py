@@ -60,7 +60,7 @@ def solve(
         edges: pairs.
         tolerance: m, what an edge that is right may disagree by.
         start_information: (N, 6, 6), how surely the start is known, world axes about the camera
-            centre, inverse of m^2 and rad^2; it counts against edges of deviation ``tolerance / 3``.
+            centre, inverse of m^2 and rad^2; an edge's deviation is ``tolerance / 3``.
     """
     T = T_map_camera.copy()
     if not edges:
@@ -74,7 +74,9 @@ def solve(
     for _ in range(ROUNDS):
         middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-30)) - mu
         believed = np.where(
-            squared <= limit * mu / (mu + 1), 1.0, np.where(squared >= limit * (mu + 1) / mu, 0.0, middle)
+            squared <= limit * mu / (mu + 1),
+            1.0,
+            np.where(squared >= limit * (mu + 1) / mu, 0.0, middle),
         )
         T = _descend(T, T_map_camera, edges, believed, information, 2)
         squared = np.square(_disagreement(T, edges))
@@ -126,7 +128,9 @@ def _descend(
                 blocks.append(weight[:, None, None] * np.swapaxes(J, 1, 2) @ K)
                 rows.append(k)
                 columns.append(other)
-        step = _solve(n, np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), gradient)
+        step = _solve(
+            n, np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), gradient
+        )
         T = se3.retract(T, step)
         if np.abs(step).max() < 1e-9:
             break

@@ -154,8 +154,8 @@ def _candidate(
     fixed = views[i].raster
     both = fixed.seen & moved.seen
     y, x = np.nonzero(both)
-    xy = (np.stack([x, y], axis=1) - lattice.side // 2) * lattice.cell
-    apart = fixed.heights[both].astype(float) - moved.heights[both]
+    xy = np.asarray((np.stack([x, y], axis=1) - lattice.side // 2) * lattice.cell, float)
+    apart = fixed.heights[both].astype(float) - moved.heights[both].astype(float)
     height, along_x, along_y = _plane(xy, apart)
     # about the centre of frame i, which lies at the height of its surface
     tilt = se3.exp_so3([along_y, -along_x, 0.0])
@@ -171,12 +171,12 @@ def _at(t: Floats) -> Floats:
 def _plane(xy: Floats, z: Floats) -> tuple[float, float, float]:
     """Fit ``z = a + b x + c y``, robustly (Tukey)."""
     A = np.column_stack([np.ones(len(xy)), xy])
-    weight = np.ones(len(z))
-    found = np.zeros(3)
+    weight: Floats = np.ones(len(z))
+    found: Floats = np.zeros(3)
     for _ in range(8):
         W = A * weight[:, None]
         found = np.linalg.solve(A.T @ W + 1e-9 * np.eye(3), W.T @ z)
         residual = z - A @ found
         scale = 4.685 * max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
-        weight = np.square(np.maximum(1 - (residual / scale) ** 2, 0.0))
+        weight = np.asarray(np.square(np.maximum(1 - (residual / scale) ** 2, 0.0)))
     return float(found[0]), float(found[1]), float(found[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.dataset import Dataset
 from depthba.pairwise import correlate, graph, refine
 from depthba.pairwise.raster import Lattice, lattice_for, rasterise, relief
 from depthba.pairwise.search import Candidate, Doubt, View, middle, search, shared, view_of
@@ -32,10 +34,8 @@ PARTNERS = 3
 PLAUSIBLE, SURE, ALIKE = 10.0, 15.0, 0.6
 # What pairs may disagree by in the graph, in cells: as correlation finds them, and refined.
 COARSE, FINE = 3.0, 0.5
-# Size of GICP's voxels and its reaches, in cells.
-VOXEL, REACHES = 0.33, (3.0, 1.0)
-# Rounds of GICP and graph.
-ROUNDS = 2
+# Size of GICP's voxels, and how far a point's counterpart may be in each of its rounds, in cells.
+VOXEL, REACHES = 0.5, (3.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,25 @@ def pairwise_poses(
         return _Frames(clouds, T_world_camera, sigma_t, sigma_r, spacing, pool).solve()
 
 
+def dataset_poses(
+    dataset: Dataset, sigma_t: Floats, sigma_r: Floats, threads: int | None = None
+) -> PairwiseStart:
+    """Do the same for the measured poses of a dataset; frames left where they were are logged."""
+    from depthba.optimiser.problem import point_spacing
+
+    clouds = [frame.points() for frame in dataset]
+    seen = any(len(c) for c in clouds)
+    spacing = point_spacing(dataset.sensor, clouds) if seen else 1.0
+    measured = dataset.T_world_camera_measured
+    start = pairwise_poses(clouds, measured, sigma_t, sigma_r, spacing, threads)
+    for k in start.left:
+        logging.getLogger(__name__).warning(
+            "frame %d: no other frame matches it surely; it starts where it was measured",
+            dataset[k].id,
+        )
+    return start
+
+
 class _Frames:
     """The frames in a common map plane, with what all steps need of them."""
 
@@ -132,8 +151,8 @@ class _Frames:
         T = graph.solve(self.T_start, edges, COARSE * lattice.cell, information).T_map_camera
         thinned = self.each(lambda p: refine.prepare(p, VOXEL * lattice.cell), self.clouds)
         pairs: tuple[Pair, ...] = ()
-        for _ in range(ROUNDS):
-            pairs, T = self.refined(thinned, T, information)
+        for reach in REACHES:
+            pairs, T = self.refined(thinned, T, reach * lattice.cell, information)
         tied = {k for p in pairs if p.used for k in (p.i, p.j)}
         left = tuple(k for k in range(1, len(T)) if k not in tied)
         poses = se3.inverse(self.T_map_world) @ T
@@ -185,19 +204,16 @@ class _Frames:
         return [c for some in found for c in some if c]
 
     def refined(
-        self, thinned: list[tuple[Any, Any]], T: Floats, information: Floats
+        self, thinned: list[tuple[Any, Any]], T: Floats, reach: float, information: Floats
     ) -> tuple[tuple[Pair, ...], Floats]:
         """Refine all pairs that overlap at given poses, and make the poses agree with them."""
         lattice = self.lattice
         views = self.views(T)
         compared = self.overlapping(views)
-        reaches = tuple(r * lattice.cell for r in REACHES)
 
         def one(pair: tuple[int, int]) -> tuple[Floats, int, float, float]:
             i, j = pair
-            T_i_j, inliers = refine.align(
-                thinned[i], thinned[j], se3.inverse(T[i]) @ T[j], reaches
-            )
+            T_i_j, inliers = refine.align(thinned[i], thinned[j], se3.inverse(T[i]) @ T[j], reach)
             local = _moved(self.clouds[j], T[i] @ T_i_j) - views[i].centre
             raster = rasterise(local, lattice)
             r, evidence = correlate.compare(
