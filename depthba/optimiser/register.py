@@ -101,7 +101,7 @@ def _register(
     workers: Workers,
 ) -> Result:
     preset = schedule.PRESETS[options.preset]
-    start = start_poses(dataset, options.init)
+    start = start_poses(dataset, options)
     problem = prepare(dataset, start, options.roi)
     clock.lap("read")
     sigma_t, sigma_r = pose_sigmas(dataset, options)
@@ -185,18 +185,23 @@ def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
     return ("quadratic", "robust") if index == 0 else ("robust",)
 
 
-def start_poses(dataset: Dataset, init: str) -> NDArray[np.float64]:
+def start_poses(dataset: Dataset, options: Options) -> NDArray[np.float64]:
     """Return (N, 4, 4) T_world_camera to start from.
 
-    Measured, identity, or a TUM file joined by stamp.
+    Measured, identity, from pairs of frames, or a TUM file joined by stamp.
     """
-    measured = dataset.T_world_camera_measured
+    init, measured = options.init, dataset.T_world_camera_measured
     if init == "measured":
         return measured
     if init == "identity":
         return np.repeat(measured[:1], len(measured), axis=0)
+    if init == "pairwise":
+        from depthba.pairwise import dataset_poses
+
+        sigma_t, sigma_r = pose_sigmas(dataset, options)
+        return dataset_poses(dataset, sigma_t, sigma_r, options.threads).T_world_camera
     if not Path(init).is_file():
-        raise OptionError(f"--init {init}: expected measured, identity or a file of poses")
+        raise OptionError(f"--init {init}: expected measured, identity, pairwise or a file of poses")
     stamps, poses = read_tum(init)[:2]
     found = []
     for frame in dataset:
