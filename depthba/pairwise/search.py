@@ -175,7 +175,7 @@ def _plane(xy: Floats, z: Floats) -> tuple[float, float, float]:
     found: Floats = np.zeros(3)
     for _ in range(8):
         W = A * weight[:, None]
-        found = np.linalg.solve(A.T @ W + 1e-9 * np.eye(3), W.T @ z)
+        found = np.asarray(np.linalg.solve(A.T @ W + 1e-9 * np.eye(3), W.T @ z))
         residual = z - A @ found
         scale = 4.685 * max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
         weight = np.asarray(np.square(np.maximum(1 - (residual / scale) ** 2, 0.0)))
