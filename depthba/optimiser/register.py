@@ -201,7 +201,7 @@ def start_poses(dataset: Dataset, options: Options) -> NDArray[np.float64]:
         sigma_t, sigma_r = pose_sigmas(dataset, options)
         return dataset_poses(dataset, sigma_t, sigma_r, options.threads).T_world_camera
     if not Path(init).is_file():
-        raise OptionError(f"--init {init}: expected measured, identity, pairwise or a file of poses")
+        raise OptionError(f"--init {init}: expected measured, identity, pairwise or a file")
     stamps, poses = read_tum(init)[:2]
     found = []
     for frame in dataset:
