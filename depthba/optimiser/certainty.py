@@ -10,14 +10,45 @@ from scipy.linalg import block_diag, eigh
 
 from depthba.optimiser import eliminate, kernels
 from depthba.optimiser.grid import Grid
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, fronts_of, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, fronts_of, robust_sigma
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
+from depthba.optimiser.workers import Workers
 from depthba.result import WeakDirection
 
 # A direction is weak when more than this share of what is known about it comes from the measured
 # pose.
 WEAK = 0.2
+# Points of a frame that its noise is measured on.
+SAMPLE = 5000
+# Leverage above which a residual says nothing about its point's noise.
+FOLLOWED = 0.7
+
+
+def noise_sigma(
+    problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation
+) -> float:
+    """Return the robust standard deviation of the points' noise, m.
+
+    A map with few points on a node follows them, so that their residuals are smaller than their
+    noise: each is divided by the root of what its leverage leaves (the externally known part of a
+    studentised residual, Cook & Weisberg 1982).
+    """
+    nodes = np.empty((*grid.shape, 3))
+    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
+    fronts = fronts_of(problem, state.T_map_camera)
+    found = []
+    for i, (frame, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True)):
+        stride = max(1, len(frame) // SAMPLE)
+        pull = np.empty(len(frame.points[::stride]))
+        kernels.leverages(
+            frame.points, stride, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing,
+            nodes, loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i], lin.C.own, pull,
+        )  # fmt: skip
+        free = pull < FOLLOWED
+        found.append(np.abs(lin.residuals[i][::stride][free]) / np.sqrt(1.0 - pull[free]))
+    each = np.concatenate(found)
+    return float(1.4826 * np.median(each)) if len(each) else robust_sigma(lin.residuals)
 
 
 @dataclass(frozen=True)
@@ -41,7 +72,7 @@ def correlation(
     prior: PosePrior,
     free: NDArray[np.bool_],
     workers: Workers,
-    tolerance: float = 1e-3,
+    reduction: eliminate.Reduction | None = None,
 ) -> Correlation:
     """Measure how the residuals' correlation over the image inflates the variance of the poses.
 
@@ -52,7 +83,8 @@ def correlation(
     the prior P, so that the directions count that the data hold least. The prior's weight T depends
     on the factor in turn, which a few rounds settle.
     """
-    S = eliminate.exact(lin, workers, tolerance)
+    reduction = reduction or eliminate.reduce(lin, workers)
+    S = reduction.S
     keep = np.repeat(free, 6)
     if not keep.any():
         return Correlation(1.0, S, 0.0)
@@ -62,7 +94,7 @@ def correlation(
     rng = np.random.default_rng(0)
     random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
     scores = [
-        block_scores(problem, grid, state, loss, lin, blocks, workers)[:, keep]
+        block_scores(problem, grid, state, loss, lin, blocks, workers, reduction)[:, keep]
         for blocks in (tuple(f.blocks for f in problem.frames), random)
     ]
     scores = [s - s.mean(axis=0) for s in scores]
@@ -84,7 +116,7 @@ def block_scores(
     lin: Linearisation,
     blocks: tuple[NDArray[np.uint8], ...],
     workers: Workers,
-    tolerance: float = 0.1,
+    reduction: eliminate.Reduction,
 ) -> NDArray[np.float64]:
     """Return the reduced gradient of each block of points, (blocks, 6N).
 
@@ -107,8 +139,7 @@ def block_scores(
                 grid.origin, grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap,
                 lin.weights[i], order[i][first[i][block] : first[i][block + 1]], g[i], field,
             )  # fmt: skip
-        answer, _ = lin.C.solve(-field, tolerance)
-        return (g + eliminate.gather(lin, answer)).ravel()
+        return (g - eliminate.gathered(reduction.answers, field)).ravel()
 
     return np.stack(workers.map(score, range(count)))
 

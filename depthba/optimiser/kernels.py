@@ -358,6 +358,34 @@ def slope_noise(
 
 
 @nb.njit(cache=True, nogil=True)
+def leverages(
+    points, stride, R, t, origin, spacing, nodes, along_ray, slope, front, cap, weights, own, out,
+):  # fmt: skip
+    """Write to ``out`` (k,) how much every ``stride``-th point pulls the map to itself.
+
+    0: not at all, 1: the map follows it. ``own`` (ny, nx) is the map's diagonal, which is right on
+    average over evenly spread points. NaN off the map.
+    """
+    pose = _scalars(R, t, origin, spacing)
+    cells = _inside(nodes, 0, 0, nodes.shape[1], nodes.shape[0])
+    for i in range(out.shape[0]):
+        k = i * stride
+        out[i] = np.nan
+        if weights[k] <= 0.0:
+            continue
+        on, x, y, a, b, _, _, _, _, norm2, _, _ = _residual(
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose,
+            cells, nodes, along_ray, slope, front, cap,
+        )  # fmt: skip
+        if on:
+            h00, h10, h01, h11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+            out[i] = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2 * (
+                h00 * h00 / own[y, x] + h10 * h10 / own[y, x + 1]
+                + h01 * h01 / own[y + 1, x] + h11 * h11 / own[y + 1, x + 1]
+            )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True)
 def splat(points, R, t, origin, spacing, total, count):
     """Add the points' heights to the nodes nearest to them: their sum and number, each (ny, nx)."""
     ny, nx = total.shape

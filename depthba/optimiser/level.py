@@ -32,9 +32,11 @@ def make_level(
     spacing: float,
     preset: schedule.Preset,
     options: Options,
+    last: bool = True,
 ) -> Level:
-    """Lay the grid of a level and fix what stays fixed on it."""
-    problem = problem.thinned(schedule.stride(problem, spacing))
+    """Lay the grid of a level and fix what stays fixed on it. The last one takes every point."""
+    if not last:
+        problem = problem.thinned(schedule.stride(problem, spacing))
     grid = make_grid(problem, spacing, 2 * spacing)
     averages = average(problem, poses, grid)
     if preset.robust:

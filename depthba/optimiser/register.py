@@ -15,16 +15,17 @@ from scipy.linalg import block_diag
 from depthba import se3
 from depthba.dataset import Dataset
 from depthba.errors import OptionError
-from depthba.optimiser import certainty, schedule
+from depthba.optimiser import certainty, eliminate, schedule
 from depthba.optimiser.grid import average, filled, make_grid
 from depthba.optimiser.level import Level, level_heights, make_level
-from depthba.optimiser.linearise import State, Workers, linearise, robust_sigma
+from depthba.optimiser.linearise import State, linearise, robust_sigma
 from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import PosePrior, pose_prior
 from depthba.optimiser.problem import Problem, prepare
 from depthba.optimiser.reporting import depth_map, frame_reports, iteration, verdict
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
+from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration, Result
 from depthba.trajectory import read_tum
@@ -40,6 +41,10 @@ GAIN = 0.02
 # Where the estimate owes the measured poses less than this in every direction, their exact weight
 # is of no account.
 NEGLIGIBLE = 0.002
+# What may be left to go at the end, in standard deviations.
+SETTLED = 0.03
+# Tolerance of a reduced matrix that only has to be near the one it preconditions.
+NEAR = 1e-2
 
 
 @dataclass
@@ -121,7 +126,9 @@ def _register(
     known: certainty.Correlation | None = None
     poses, heights, previous = problem.T_map_camera, None, None
     for index, spacing in enumerate(levels):
-        level = make_level(problem, poses, spacing, preset, options)
+        level = make_level(
+            problem, poses, spacing, preset, options, last=index == len(levels) - 1
+        )
         heights = level_heights(level, heights, previous)
         state, lin = solve_map(
             level.problem, level.grid, State(poses, heights), level.loss, level.smooth, workers, 1
@@ -131,14 +138,20 @@ def _register(
             rules = Rules(
                 _scale(preset, phase),
                 options.max_iterations,
+                settled=SETTLED if last else 0.1,
                 gain=0.0 if last else GAIN,
             )
             temperature = 0.0
+            clock.lap(f"level {index} map")
+            reduction = eliminate.reduce(lin, workers, NEAR)
+            clock.lap(f"level {index} reduce")
             if preset.prior:
                 if known is None or known.owed > NEGLIGIBLE:
                     known = certainty.correlation(
-                        level.problem, level.grid, state, level.loss, lin, prior, free, workers
-                    )
+                        level.problem, level.grid, state, level.loss, lin, prior, free, workers,
+                        reduction,
+                    )  # fmt: skip
+                clock.lap(f"level {index} correlation")
                 temperature = known.inflation * robust_sigma(lin.residuals) ** 2
 
             def report(
@@ -153,7 +166,7 @@ def _register(
 
             outcome = solve_level(
                 level.problem, level.grid, state, level.loss, rules, acting, temperature,
-                free, level.smooth, workers, report,
+                free, level.smooth, workers, report, reduction.S,
             )  # fmt: skip
             state, lin = outcome.state, outcome.lin
             clock.lap(f"level {index} {phase}")
@@ -255,15 +268,15 @@ def _conclude(
     better = cost_end <= cost_start
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     clock.lap("compare with the start")
-    sigma = robust_sigma(lin.residuals)
+    sigma = certainty.noise_sigma(level.problem, level.grid, state, outcome.loss, lin)
     known = certainty.correlation(
-        level.problem, level.grid, state, outcome.loss, lin, prior, free, workers, 1e-8
+        level.problem, level.grid, state, outcome.loss, lin, prior, free, workers
     )
     factor = known.inflation
     held_by_prior = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])
     S = without_slope_noise(
         level.problem, level.grid, state, outcome.loss, lin, known.S,
-        factor * sigma**2 * held_by_prior, free, workers,
+        factor * sigma**2 * held_by_prior, free, workers, sigma,
     )  # fmt: skip
     judged = certainty.assess(
         level.problem, state, lin, S, factor * sigma**2, prior, preset.prior, free,

@@ -14,11 +14,14 @@ from depthba.options import Options
 
 # Slope that noise alone may put into the map: above it the gradient, and with it the poses, are
 # biased.
-NOISE_SLOPE = 0.02
+NOISE_SLOPE = 0.04
+# The finest map's spacing, in point spacings, where noise allows: finer gains nothing but cells that
+# one point decides.
+FINEST = 1.2
 # The coarsest cells are this many times the distance by which the start poses may displace a point.
 REACH = 1.5
 # Points of one frame on a node, of which more add little before the finest level.
-ENOUGH = 16
+ENOUGH = 6
 # A map of fewer nodes than this across is no map.
 FEWEST = 12
 
@@ -84,7 +87,7 @@ def finest_spacing(problem: Problem) -> float:
         return 4 * problem.spacing
     area = float(np.prod(problem.upper - problem.lower))
     density = sum(len(f) for f in problem.frames) / max(area, 1e-12)
-    return max(problem.spacing, float(np.sqrt(problem.noise / NOISE_SLOPE / np.sqrt(density))))
+    return max(FINEST * problem.spacing, float(np.sqrt(problem.noise / NOISE_SLOPE / np.sqrt(density))))
 
 
 def spacings(

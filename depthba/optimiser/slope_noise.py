@@ -44,6 +44,7 @@ def without_slope_noise(
     held: NDArray[np.float64],
     free: NDArray[np.bool_],
     workers: Workers,
+    sigma: float | None = None,
 ) -> NDArray[np.float64]:
     """Return the exact reduced matrix S (6N, 6N) less what noise in the map's slope put into it.
 
@@ -57,8 +58,9 @@ def without_slope_noise(
         held: (6N, 6N) what the measured poses add to S: the share of the noise counts against both.
         free: (N,) frames that moved.
         workers: the threads.
+        sigma: standard deviation of the points' noise, m; None: of their residuals.
     """
-    variance = robust_sigma(lin.residuals) ** 2
+    variance = (robust_sigma(lin.residuals) if sigma is None else sigma) ** 2
     noisy = _noise_linearisation(problem, grid, state, loss, lin, workers)
     n = len(free)
     bound = np.zeros_like(S)

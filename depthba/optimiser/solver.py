@@ -15,9 +15,16 @@ from numpy.typing import NDArray
 
 from depthba.optimiser import eliminate
 from depthba.optimiser.grid import Grid
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
+from depthba.optimiser.mixing import Mixer
 from depthba.optimiser.prior import PosePrior, move
 from depthba.optimiser.problem import Problem
+from depthba.optimiser.stencil import MapSolver
+from depthba.optimiser.workers import Workers
+
+
+# Factor by which steps are taken to shrink before two of them say more.
+PACE = 0.5
 
 
 @dataclass(frozen=True)
@@ -30,13 +37,16 @@ class Rules:
     limit: int
     """Most iterations."""
     settled: float = 0.1
-    """Converged when the step is below this many standard deviations of the poses (root mean
-    square)."""
+    """Converged when what is left to go is below this many standard deviations of the poses (root
+    mean square)."""
     gain: float = 0.0
     """Enough when a step lowers the cost by less than this share: a coarse level only has to bring
     the next into reach."""
+    believed: float = 1.0
+    """Factor of the poses' variance over what independent residuals would leave: it scales the
+    standard deviations above."""
     tolerance: float = 1e-2
-    """Relative residual at which the correction of the lumped step stops."""
+    """Relative residual of the reduced system at which an iterative step is good enough."""
     outer: int = 12
     """Most products with the exact reduced matrix in one step."""
 
@@ -73,13 +83,14 @@ def solve_map(
     smooth: NDArray[np.bool_],
     workers: Workers,
     rounds: int = 2,
+    tolerance: float = 1e-4,
 ) -> tuple[State, Linearisation]:
     """Solve the heights for given poses; return the state and the linearisation there."""
     lin = linearise(problem, grid, state, loss, workers, smooth)
     for _ in range(rounds):
-        answer, _ = lin.C.solve(-lin.g_map, 1e-6)
+        answer, _ = MapSolver(lin.C, tolerance, workers).solve(-lin.g_map, tolerance)
         state = replace(state, heights=state.heights + answer)
-        lin = linearise(problem, grid, state, loss, workers, smooth)
+        lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
     return state, lin
 
 
@@ -95,6 +106,7 @@ def solve_level(
     smooth: NDArray[np.bool_],
     workers: Workers,
     report: Callable[[Progress], None],
+    near: NDArray[np.float64] | None = None,
 ) -> Outcome:
     """Iterate to convergence on one grid with one loss.
 
@@ -111,34 +123,54 @@ def solve_level(
         smooth: (ny, nx) nodes under the smoothing term.
         workers: the threads.
         report: called after each iteration.
+        near: (6N, 6N) the reduced matrix about where the level starts, if known.
     """
     lin = linearise(problem, grid, state, replace(loss, robust_c=0.0), workers, smooth)
     sigma = robust_sigma(lin.residuals)
     loss = judge = _rescaled(loss, rules, sigma)
+    spare = None
     if rules.robust:
-        lin = linearise(problem, grid, state, loss, workers, smooth)
+        lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
     damping, converged = 0.0, False
     dof = 6 * max(int(free.sum()), 1)
+    mixer, pace, previous = Mixer(), PACE, np.inf
     for _ in range(rules.limit):
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
-        step = eliminate.solve(lin, free, believed, damping, workers, rules.tolerance, rules.outer)
-        candidate = State(move(state.T_map_camera, lin.pivots, step.pose), state.heights + step.map)
-        after = linearise(problem, grid, candidate, loss, workers, smooth, judge)
+        here = eliminate.reduce(lin, workers) if eliminate.direct_is_shorter(lin) else None
+        step = eliminate.solve(
+            lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here
+        )
+        length = float(np.sqrt(max(step.decrement, 0.0)))
+        metric = here.S if here is not None else near
+        mixed = step if metric is None or damping > 0 else mixer.mix(step, metric)
+        candidate = State(
+            move(state.T_map_camera, lin.pivots, mixed.pose), state.heights + mixed.map
+        )
+        after = linearise(problem, grid, candidate, loss, workers, smooth, judge, spare)
         before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
         after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
-        small = step.decrement < rules.settled**2 * dof * max(temperature, sigma**2, 1e-30)
+        # steps that shrink by the same factor leave a geometric series to go
+        left = length * pace / (1 - pace)
+        deviation = np.sqrt(dof * max(rules.believed * sigma**2, 1e-30))
+        small = left < rules.settled * deviation
         # with the nodal gradient the cost may rise in the last digits while the poses still settle
         accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6))
         if accepted:
-            state, lin, judge = candidate, after, loss
+            pace = min(max(0.5 * (pace + length / previous), 0.1), 0.9)
+            previous = length
+            mixer.took(mixed)
+            state, lin, spare, judge = candidate, after, lin, loss
             sigma = robust_sigma(lin.residuals)
             loss = _rescaled(
                 loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma
             )
-            damping = damping / 10 if damping > 1e-6 else 0.0
+            damping = damping / 10 if damping > 1e-3 else 0.0
         else:
-            damping = max(10 * damping, 1e-4)
+            spare = after
+            if mixed is step:
+                damping = max(10 * damping, 1e-2)
+            mixer.forget()
         report(Progress(state, lin, before_cost, step, damping, accepted, sigma))
         if accepted and (small or before_cost - after_cost < rules.gain * before_cost):
             converged = True

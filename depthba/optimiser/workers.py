@@ -1,0 +1,79 @@
+"""A few threads over which work is dealt out, and the memory they work in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser.problem import Problem
+
+T = TypeVar("T")
+
+# Rows of a grid below which a second thread costs more than it saves.
+LEAST_ROWS = 64
+
+
+@dataclass(frozen=True)
+class Scratch:
+    """What a pass over the points needs only while it runs."""
+
+    nodes: NDArray[np.float64]
+    """(ny, nx, 3), heights and gradients."""
+    totals: NDArray[np.float64]
+    """(threads, ny, nx, 6), stencil and gradient of the map by thread."""
+
+
+class Workers:
+    """A few threads. Sums are formed in a fixed order, whatever finishes first.
+
+    One pass at a time: the scratch memory is shared.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._scratch: Scratch | None = None
+
+    def map(self, function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
+        """Return the results in the order of the items."""
+        if self._pool is None:
+            return list(map(function, *items))
+        return list(self._pool.map(function, *items))
+
+    def close(self) -> None:
+        """End the threads and let go of the memory."""
+        self._scratch = None
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def shares(self, problem: Problem) -> list[range]:
+        """Deal the frames out in runs of about equal numbers of points."""
+        sizes = np.array([len(f) for f in problem.frames], dtype=float)
+        ends = np.cumsum(sizes) - sizes / 2
+        share = np.minimum(
+            (ends / max(sizes.sum(), 1) * self.threads).astype(int), self.threads - 1
+        )
+        return [
+            range(int(np.flatnonzero(share == k)[0]), int(np.flatnonzero(share == k)[-1]) + 1)
+            for k in range(self.threads)
+            if (share == k).any()
+        ]
+
+    def bands(self, rows: int) -> list[tuple[int, int]]:
+        """Deal the rows of a grid out: first row and the one past the last."""
+        count = max(1, min(self.threads, rows // LEAST_ROWS))
+        ends = [rows * k // count for k in range(count + 1)]
+        return list(zip(ends[:-1], ends[1:], strict=True))
+
+    def scratch(self, shape: tuple[int, int], parts: int) -> Scratch:
+        """Return memory for a pass over a grid of ``shape``; its values are not set."""
+        held = self._scratch
+        if held is None or held.nodes.shape[:2] != shape or len(held.totals) != parts:
+            held = Scratch(np.empty((*shape, 3)), np.empty((parts, *shape, 6)))
+            self._scratch = held
+        return held
