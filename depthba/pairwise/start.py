@@ -35,7 +35,7 @@ PLAUSIBLE, SURE, ALIKE = 10.0, 15.0, 0.6
 # What pairs may disagree by in the graph, in cells: as correlation finds them, and refined.
 COARSE, FINE = 3.0, 0.5
 # Size of GICP's voxels, and how far a point's counterpart may be in each of its rounds, in cells.
-VOXEL, REACHES = 0.5, (3.0, 1.0)
+VOXEL, REACHES = 1.0, (3.0, 1.0)
 
 
 @dataclass(frozen=True)
