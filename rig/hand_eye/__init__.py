@@ -1,0 +1,1 @@
+"""Hand-eye calibration: where the camera sits on the flange."""

@@ -1,0 +1,157 @@
+"""A fixed pattern of the camera: an error of the range that is the same in every frame.
+
+It moves the scene alike in front of every camera, and so does a wrong hand-eye transform. The
+pattern is therefore an unknown, a sum of cosine waves over the image as fine as the blocks over
+which residuals are taken to be correlated. A constant and a slope are left out: they are a part of
+where the camera says that it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.dataset import Sensor
+from depthba.optimiser import eliminate
+from depthba.optimiser.level import Level
+from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise
+from depthba.optimiser.problem import BLOCKS, Problem
+
+Array = NDArray[np.float64]
+
+# How far points are moved to see what that does, m.
+DELTA = 5e-4
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The waves at every point."""
+
+    at: tuple[NDArray[np.float32], ...]
+    """(n, m) per frame, by how much a unit of each moves the point along its ray, m at a point of
+    typical noise; the farther and noisier points are moved by more."""
+
+    @property
+    def count(self) -> int:
+        """How many waves there are."""
+        return self.at[0].shape[1]
+
+    def without(self, problem: Problem, pattern: Array) -> Problem:
+        """Return the problem with the pattern (m,), m, taken off."""
+        frames = []
+        for frame, waves in zip(problem.frames, self.at, strict=True):
+            points = frame.points.copy()
+            error = waves @ pattern.astype(np.float32)
+            away = np.linalg.norm(points[:, :3], axis=1)
+            points[:, :3] *= (1 - error / np.maximum(away, 1e-6))[:, None]
+            frames.append(replace(frame, points=points))
+        return replace(problem, frames=tuple(frames))
+
+
+def waves_of(problem: Problem, sensor: Sensor) -> Waves:
+    """Return the waves at the points of a problem, weights as prepared; none without rays."""
+    camera = sensor.camera
+    if camera is None or not sensor.origin:
+        return Waves(tuple(np.zeros((len(f), 0), np.float32) for f in problem.frames))
+    columns, rows = BLOCKS
+    # the pixels' centres of a small image stand for all in finding constant and slope
+    grid = [(np.arange(8 * n) + 0.5) / (8 * n) for n in (columns, rows)]
+    across, down = (a.ravel() for a in np.meshgrid(*grid))
+    plain = np.stack([np.ones_like(across), across - 0.5, down - 0.5], axis=1)
+    raw = _cosines(across, down)
+    taken = np.linalg.lstsq(plain, raw, rcond=None)[0]
+    rms = np.sqrt(np.mean((raw - plain @ taken) ** 2, axis=0))
+    keep = rms > 0.2
+    found = []
+    for frame in problem.frames:
+        p = frame.points.astype(float)
+        u = (p[:, 0] / p[:, 2] * camera.fx + camera.cx + 0.5) / camera.width
+        v = (p[:, 1] / p[:, 2] * camera.fy + camera.cy + 0.5) / camera.height
+        plain = np.stack([np.ones_like(u), u - 0.5, v - 0.5], axis=1)
+        wave = (_cosines(u, v) - plain @ taken)[:, keep] / rms[keep]
+        found.append((wave / np.maximum(p[:, 3:4], 1e-6)).astype(np.float32))
+    return Waves(tuple(found))
+
+
+def _cosines(u: Array, v: Array) -> Array:
+    """Return (n, 48) cosines with as many half waves as there are blocks, u and v from 0 to 1."""
+    across = np.cos(np.pi * u[:, None] * np.arange(BLOCKS[0]))
+    down = np.cos(np.pi * v[:, None] * np.arange(BLOCKS[1]))
+    return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(u), -1))
+
+
+@dataclass(frozen=True)
+class Answers:
+    """How poses, map and residuals answer to the pattern."""
+
+    back: NDArray[np.float32]
+    """(m, ny, nx), the map's answer to a unit of each wave, sign reversed."""
+    pull: tuple[NDArray[np.float32], ...]
+    """(n,) per frame, share of each point times its residual's change with its range."""
+    own: Array
+    """(m, m), the pattern's own block, the map eliminated."""
+    cross: Array
+    """(6N, m), the coupling with the poses, the map eliminated."""
+
+    def gradient(self, waves: Waves, lin: Linearisation) -> Array:
+        """Return the pattern's gradient (m,), the map eliminated."""
+        total = -np.tensordot(self.back, lin.g_map, 2)
+        for at, pull, residual, weight in zip(
+            waves.at, self.pull, lin.residuals, lin.weights, strict=True
+        ):
+            total = total + at.T @ (np.nan_to_num(residual) * weight * pull)
+        return np.asarray(total, np.float64)
+
+
+def answers(
+    level: Level, state: State, loss: Loss, lin: Linearisation, waves: Waves, workers: Workers
+) -> Answers:
+    """Move all points along their rays wave by wave, with the robust weights held.
+
+    A point that is moved along its ray keeps the foot on the map where its residual is taken, so
+    that the answers are linear in the pattern.
+    """
+    frozen = replace(loss, robust_c=0.0)
+    weighted = tuple(
+        replace(f, points=_times(f.points, w))
+        for f, w in zip(level.problem.frames, lin.weights, strict=True)
+    )
+    problem = replace(level.problem, frames=weighted)
+
+    def at(waves: Waves, pattern: Array) -> Linearisation:
+        moved = waves.without(problem, pattern)
+        return linearise(moved, level.grid, state, frozen, workers, level.smooth)
+
+    base = at(waves, np.zeros(waves.count))
+    even = Waves(tuple(np.ones((len(f), 1), np.float32) for f in problem.frames))
+    once = at(even, np.array([DELTA]))
+    m = waves.count
+    own = np.zeros((m, m))
+    pulls = []
+    for wave, a, b, weight, frame in zip(
+        waves.at, base.residuals, once.residuals, lin.weights, level.problem.frames, strict=True
+    ):
+        # the residual falls as the point is moved back by what is taken for the pattern
+        change = np.nan_to_num((b - a) / np.float32(DELTA))
+        pulls.append((frame.points[:, 4] * change).astype(np.float32))
+        w = (weight * pulls[-1] * change).astype(np.float32)
+        own += wave.T @ (w[:, None] * wave)
+    pose = np.zeros((lin.g_pose.size, m))
+    fields, back = (np.zeros((m, *lin.g_map.shape), np.float32) for _ in range(2))
+    for k in range(m):
+        moved = at(waves, DELTA * np.eye(m)[k])
+        field = (moved.g_map - base.g_map) / DELTA
+        answer, _ = lin.C.solve(field, 1e-4)
+        fields[k], back[k] = field, answer
+        coupled = (moved.g_pose - base.g_pose) / DELTA - eliminate.gather(lin, answer)
+        pose[:, k] = coupled.ravel()
+    own -= np.tensordot(fields, back, ((1, 2), (1, 2)))
+    return Answers(back, tuple(pulls), (own + own.T) / 2, pose)
+
+
+def _times(points: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    out = points.copy()
+    out[:, 4] *= weight
+    return out
