@@ -24,11 +24,12 @@ STEEPEST = 1.15
 # columns, rows, width, height, spacing (m)
 Case = tuple[int, int, int, int, float]
 SERIES: dict[str, list[Case]] = {
+    # the map is fine enough for no points to be thinned out
     "points": [
-        (4, 3, 160, 120, 0.01),
-        (4, 3, 226, 170, 0.01),
-        (4, 3, 320, 240, 0.01),
-        (4, 3, 452, 340, 0.01),
+        (4, 3, 160, 120, 0.007),
+        (4, 3, 226, 170, 0.007),
+        (4, 3, 320, 240, 0.007),
+        (4, 3, 452, 340, 0.007),
     ],
     "frames": [
         (3, 2, 320, 240, 0.01),
@@ -46,7 +47,7 @@ SERIES: dict[str, list[Case]] = {
 if sets.FULL:
     SERIES["frames"].append((12, 8, 320, 240, 0.01))
     SERIES["cells"].append((4, 3, 320, 240, 0.0028))
-    SERIES["points"].append((4, 3, 640, 480, 0.01))
+    SERIES["points"].insert(0, (4, 3, 112, 84, 0.007))
 LARGEST: Case = (20, 10, 320, 240, 0.0046)
 GIGABYTES = 8.0
 
@@ -120,18 +121,22 @@ def plot(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
         "seconds": ("CPU s in all", "tab:orange"),
         "gigabytes": ("GB, beyond the empty process", "tab:green"),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4.2), sharey=True)
+    units = {"points": (1e6, "million points"), "frames": (1, "frames"), "cells": (1e3, "k cells")}
+    figure, axes = plt.subplots(1, 3, figsize=(12, 4.6), sharey=True)
     for axis, (name, rows) in zip(axes, found.items(), strict=True):
-        x = np.array([row[name] for row in rows], dtype=float)
+        unit, label = units[name]
+        x = np.array([row[name] for row in rows]) / unit
         for of, (words, colour) in quantities.items():
             y = np.array([row[of] for row in rows])
             axis.loglog(
                 x, y, "o-", color=colour, label=f"{words}: slope {slope(rows, name, of):.2f}"
             )
             axis.loglog(x, y[0] * x / x[0], ":", color=colour, linewidth=1)
-        axis.set_xlabel(name)
+        axis.set_xticks(x, [f"{v:.3g}" for v in x])
+        axis.set_xticks([], minor=True)
+        axis.set_xlabel(label)
         axis.grid(True, which="both", alpha=0.25)
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False)
     axes[0].set_title("12 frames, equal cells", fontsize=10)
     axes[1].set_title("frames with their own ground", fontsize=10)
     axes[2].set_title("12 frames, equal points", fontsize=10)
