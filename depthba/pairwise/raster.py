@@ -70,16 +70,28 @@ def rasterise(points: Floats, lattice: Lattice) -> Raster:
 def relief(raster: Raster) -> NDArray[np.float32]:
     """Return what stands out from the mean surface about it (side, side), cut and 0 where unseen.
 
-    Constants vanish and slopes all but vanish, so an error of the frame's height, roll or pitch
-    leaves it as it is.
+    Planes vanish, so an error of the frame's height, roll or pitch leaves it as it is.
     """
+    if not raster.seen.any():
+        return np.zeros(raster.heights.shape, np.float32)
+    heights = np.where(raster.seen, raster.heights - _plane(raster), 0.0).astype(np.float32)
     weight = ndimage.gaussian_filter(raster.seen.astype(np.float32), WINDOW)
-    mean = ndimage.gaussian_filter(raster.heights * raster.seen, WINDOW)
-    out = np.where(raster.seen, raster.heights - mean / np.maximum(weight, 1e-6), 0.0)
-    if raster.seen.any():
-        scale = CUT * 1.4826 * float(np.median(np.abs(out[raster.seen])))
-        out = np.clip(out, -scale, scale)
-    return np.asarray(out, np.float32)
+    out = heights - ndimage.gaussian_filter(heights, WINDOW) / np.maximum(weight, 1e-6)
+    scale = CUT * 1.4826 * float(np.median(np.abs(out[raster.seen])))
+    return np.asarray(np.where(raster.seen, np.clip(out, -scale, scale), 0.0), np.float32)
+
+
+def _plane(raster: Raster) -> Floats:
+    """Return the heights (side, side) of the plane of least squares.
+
+    At the rim of what is seen the mean about a cell is that of one side: a slope would stand out.
+    """
+    y, x = (np.arange(raster.heights.shape[k]) - raster.heights.shape[k] // 2 for k in (0, 1))
+    row, column = np.nonzero(raster.seen)
+    A = np.stack([np.ones(len(row)), x[column], y[row]], axis=1)
+    z = raster.heights[raster.seen].astype(float)
+    a, b, c = np.linalg.solve(A.T @ A + 1e-9 * np.eye(3), A.T @ z)
+    return np.asarray(a + b * x[None, :] + c * y[:, None])
 
 
 @nb.njit(cache=True, nogil=True)

@@ -225,7 +225,12 @@ class _Frames:
         sound = [k for k, (_, _, r, evidence) in enumerate(found) if r > ALIKE and evidence > SURE]
         edges = [self.edge(*compared[k], found[k][0]) for k in sound]
         solution = graph.solve(T, edges, FINE * lattice.cell, information)
-        faults = [f"reliefs do not match: correlation {r:.2f}" for _, _, r, _ in found]
+        faults = [
+            f"reliefs do not match: correlation {r:.2f}"
+            if r <= ALIKE
+            else f"too little in common to be sure: evidence {evidence:.1f} of {SURE:g}"
+            for _, _, r, evidence in found
+        ]
         for k, believed, off in zip(sound, solution.believed, solution.off, strict=True):
             faults[k] = "" if believed > 0.5 else f"contradicts other pairs by {off:.3f} m"
         pairs = tuple(
