@@ -46,8 +46,8 @@ SHORT_NAMES = {
 """The same for where there is little room."""
 
 SURFACES = {
-    "clean": "It knows the surface without noise.",
-    "noisy": "Its surface is fitted to the noisy frames at the true poses, "
+    "clean": "The bound knows the surface without noise.",
+    "noisy": "The bound takes the surface fitted to the noisy frames at the true poses, "
     "less what noise adds to the slopes.",
 }
 """Where the bound takes the surface from."""
@@ -179,7 +179,7 @@ def _explanation(judged: Evaluation) -> str:
         )
     if judged.bound is not None:
         text += (
-            " The bound is on the mean absolute error, with range noise of "
+            " The bound is the least mean absolute error with range noise of "
             f"{_mm(judged.bound.sigma)} and a map of {_mm(judged.bound.spacing)} spacing. "
             f"{SURFACES[judged.bound.surface]}"
         )
