@@ -12,7 +12,14 @@ if TYPE_CHECKING:
     from depthba.camera import Camera
     from depthba.dataset import Dataset, Frame
     from depthba.depth_map import DepthMap
-    from depthba.errors import DatasetError, DepthbaError, MissingPackage, OptionError, RunError
+    from depthba.errors import (
+        Cancelled,
+        DatasetError,
+        DepthbaError,
+        MissingPackage,
+        OptionError,
+        RunError,
+    )
     from depthba.optimiser.register import register
     from depthba.options import Options
     from depthba.result import Iteration, Result
@@ -21,6 +28,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera",
+    "Cancelled",
     "Dataset",
     "DatasetError",
     "DepthMap",
@@ -38,6 +46,7 @@ __all__ = [
 
 _HOMES = {
     "Camera": "depthba.camera",
+    "Cancelled": "depthba.errors",
     "Dataset": "depthba.dataset",
     "DatasetError": "depthba.errors",
     "DepthMap": "depthba.depth_map",

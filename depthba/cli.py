@@ -46,6 +46,9 @@ VERBS = {
     "register": Verb(
         "depthba.verbs.register", "Estimate the poses and the depth map of a dataset."
     ),
+    "calibrate": Verb(
+        "rig.verbs.calibrate", "Estimate where the camera sits on the robot's flange."
+    ),
     "evaluate": Verb(
         "eval.verbs.evaluate", "Measure runs against truth, or against themselves without it."
     ),

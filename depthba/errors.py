@@ -22,3 +22,7 @@ class RunError(DepthbaError):
 
 class MissingPackage(DepthbaError):
     """An optional package is not installed: names the package and the extra that brings it."""
+
+
+class Cancelled(DepthbaError):
+    """The caller asked to stop; nothing was returned or written."""

@@ -36,3 +36,6 @@ class Options:
     (paper: no prior)."""
     max_iterations: int = 30
     """Limit for each level and phase."""
+    time_limit: float | None = None
+    """Seconds after which no further iteration begins; what was reached by then is judged and
+    returned. None: no limit."""

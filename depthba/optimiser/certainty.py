@@ -93,11 +93,9 @@ def correlation(
     count = BLOCKS[0] * BLOCKS[1]
     rng = np.random.default_rng(0)
     random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
-    scores = [
-        block_scores(problem, grid, state, loss, lin, blocks, workers, reduction)[:, keep]
-        for blocks in (tuple(f.blocks for f in problem.frames), random)
-    ]
-    scores = [s - s.mean(axis=0) for s in scores]
+    groups = [np.stack(g) for g in zip((f.blocks for f in problem.frames), random, strict=True)]
+    scores = block_scores(problem, grid, state, loss, lin, groups, workers, reduction)[..., keep]
+    scores = scores - scores.mean(axis=1, keepdims=True)
     variance = robust_sigma(lin.residuals) ** 2
     factor = 1.0
     for _ in range(10):
@@ -114,34 +112,40 @@ def block_scores(
     state: State,
     loss: Loss,
     lin: Linearisation,
-    blocks: tuple[NDArray[np.uint8], ...],
+    groups: list[NDArray[np.uint8]],
     workers: Workers,
     reduction: eliminate.Reduction,
 ) -> NDArray[np.float64]:
-    """Return the reduced gradient of each block of points, (blocks, 6N).
+    """Return the reduced gradient of each group of points, (kinds, groups, 6N).
 
-    The map has answered to it.
+    The map has answered to it. ``groups`` says for each frame, (kinds, n), which group a point is
+    in, for one or several ways to group them.
     """
     nodes = np.empty((*grid.shape, 3))
     kernels.nodal_gradients(state.heights, grid.spacing, nodes)
     fronts = fronts_of(problem, state.T_map_camera)
-    count = BLOCKS[0] * BLOCKS[1]
-    order = [np.argsort(b, kind="stable") for b in blocks]
-    first = [
-        np.searchsorted(b[o], np.arange(count + 1)) for b, o in zip(blocks, order, strict=True)
-    ]
+    shape = len(groups[0]), BLOCKS[0] * BLOCKS[1], 6
+    answers = reduction.answers
 
-    def score(block: int) -> NDArray[np.float64]:
-        g, field = np.zeros((len(problem.frames), 6)), np.zeros(grid.shape)
-        for i, (frame, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True)):
-            kernels.block_gradient(
+    def of(frames: range) -> NDArray[np.float64]:
+        scores = np.zeros((len(problem.frames), *shape))
+        for i in frames:
+            frame, T, foot = problem.frames[i], state.T_map_camera[i], lin.B[i]
+            cells, shares = np.empty((len(frame), 2), np.int32), np.empty((len(frame), 3))
+            kernels.contributions(
                 frame.points, T[:3, :3].copy(), T[:3, 3].copy(), T[:3, 3] - lin.pivots[i],
                 grid.origin, grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap,
-                lin.weights[i], order[i][first[i][block] : first[i][block + 1]], g[i], field,
+                lin.weights[i], groups[i], cells, shares, scores[i],
             )  # fmt: skip
-        return (g - eliminate.gathered(reduction.answers, field)).ravel()
+            for other, answer in enumerate(answers):
+                if eliminate.meet(foot, answer):
+                    kernels.answered(
+                        cells, shares, groups[i], answer.values, answer.x, answer.y, scores[other]
+                    )
+        return scores
 
-    return np.stack(workers.map(score, range(count)))
+    total = sum(workers.map(of, workers.shares(problem)), start=np.zeros((1, 1, 1, 1)))
+    return np.asarray(np.moveaxis(total, 0, 2).reshape(*shape[:2], -1))
 
 
 @dataclass(frozen=True)

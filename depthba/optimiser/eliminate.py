@@ -157,7 +157,7 @@ def lumped(lin: Linearisation, workers: Workers) -> NDArray[np.float64]:
     n = len(lin.B)
     bound = lin.C.row_sums()
     S = np.zeros((n, 6, n, 6))
-    pairs = [(i, j) for i in range(n) for j in range(i, n) if _meet(lin.B[i], lin.B[j])]
+    pairs = [(i, j) for i in range(n) for j in range(i, n) if meet(lin.B[i], lin.B[j])]
 
     def block(pair: tuple[int, int]) -> NDArray[np.float64]:
         one, other = lin.B[pair[0]], lin.B[pair[1]]
@@ -199,7 +199,7 @@ def windows(lin: Linearisation) -> list[tuple[slice, slice]]:
 def direct_is_shorter(lin: Linearisation) -> bool:
     """Whether forming S costs less than a few products with it, judged by the sizes alone."""
     nodes = sum((y.stop - y.start) * (x.stop - x.start) for y, x in windows(lin))
-    return nodes < DIRECT * sum(map(len, lin.weights))
+    return bool(nodes < DIRECT * sum(map(len, lin.weights)))
 
 
 def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Reduction:
@@ -230,7 +230,7 @@ def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Red
         return Footprint(ys.start, xs.start, X), Footprint(ys.start, xs.start, R)
 
     solved = workers.map(columns, range(n))
-    pairs = [(i, j) for i in range(n) for j in range(i, n) if _meet(solved[i][0], solved[j][0])]
+    pairs = [(i, j) for i in range(n) for j in range(i, n) if meet(solved[i][0], solved[j][0])]
 
     def block(pair: tuple[int, int]) -> NDArray[np.float64]:
         i, j = pair
@@ -239,14 +239,14 @@ def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Red
             _product(one.values, one.x, one.y, other.values, other.x, other.y, out)
         return out
 
-    S = np.zeros((n, 6, n, 6))
+    blocks = np.zeros((n, 6, n, 6))
     for (i, j), value in zip(pairs, workers.map(block, pairs), strict=True):
-        S[i, :, j] -= value
+        blocks[i, :, j] -= value
         if i != j:
-            S[j, :, i] -= value.T
+            blocks[j, :, i] -= value.T
     for i in range(n):
-        S[i, :, i] += lin.A[i]
-    S = S.reshape(6 * n, 6 * n)
+        blocks[i, :, i] += lin.A[i]
+    S = blocks.reshape(6 * n, 6 * n)
     return Reduction((S + S.T) / 2, tuple(x for x, _ in solved))
 
 
@@ -384,7 +384,8 @@ def _preconditioned(product, factor, damp, b, tolerance, limit, back):
     return x, Sx
 
 
-def _meet(a: Footprint, b: Footprint) -> bool:
+def meet(a: Footprint, b: Footprint) -> bool:
+    """Whether two windows share nodes."""
     ha, wa = a.values.shape[:2]
     hb, wb = b.values.shape[:2]
     return bool(a.y < b.y + hb and b.y < a.y + ha and a.x < b.x + wb and b.x < a.x + wa)

@@ -160,8 +160,8 @@ def accumulate(
     for k in range(points.shape[0]):
         own, share = np.float64(points[k, 3]), np.float64(points[k, 4])
         on, x, y, a, b, qx, qy, qz, r, norm2, gx, gy = _residual(
-            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
-            along_ray, slope, front, cap,
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose,
+            cells, nodes, along_ray, slope, front, cap,
         )  # fmt: skip
         if not on or share <= 0.0:
             cost += share * charge
@@ -251,6 +251,57 @@ def accumulate(
     return cost, (cost if j2 == c2 else judged), used
 
 
+@nb.njit(cache=True, nogil=True)
+def collect(
+    totals, heights, smooth, weight, first, last, own, right, up, up_right, up_left, gradient
+):  # fmt: skip
+    """Sum the threads' stencils ``totals`` (threads, ny, nx, 6) over some rows.
+
+    Rows ``first`` to ``last``. Adds the smoothing term, ``weight`` times the squared difference of
+    neighbouring heights where both are ``smooth``, and returns its cost. Nodes that nothing touches
+    stay what they are: they get a diagonal of 1.
+    """
+    ny, nx = heights.shape
+    cost = 0.0
+    for y in range(first, last):
+        for x in range(nx):
+            o, r, u, d, a, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(totals.shape[0]):
+                node = totals[k, y, x]
+                o += node[0]
+                r += node[1]
+                u += node[2]
+                d += node[3]
+                a += node[4]
+                g += node[5]
+            if smooth[y, x]:
+                if x + 1 < nx and smooth[y, x + 1]:
+                    e = heights[y, x] - heights[y, x + 1]
+                    o += weight
+                    r -= weight
+                    g += weight * e
+                    cost += weight * e * e
+                if y + 1 < ny and smooth[y + 1, x]:
+                    e = heights[y, x] - heights[y + 1, x]
+                    o += weight
+                    u -= weight
+                    g += weight * e
+                    cost += weight * e * e
+                if x > 0 and smooth[y, x - 1]:
+                    o += weight
+                    g += weight * (heights[y, x] - heights[y, x - 1])
+                if y > 0 and smooth[y - 1, x]:
+                    o += weight
+                    g += weight * (heights[y, x] - heights[y - 1, x])
+            own[y, x] = o if o > 0.0 else 1.0
+            right[y, x] = r
+            up[y, x] = u
+            up_right[y, x] = d
+            up_left[y, x] = a
+            gradient[y, x] = g
+    return cost
+
+
 @nb.njit(cache=True, nogil=True, inline="always")
 def _couple(node, h, w0, w1, w2, w3, w4, w5):
     """Subtract a point's weighted Jacobian, times its share ``h`` of a node, from the coupling."""
@@ -272,31 +323,62 @@ def _apart(field, x, y, a, b, value):
 
 
 @nb.njit(cache=True, nogil=True)
-def block_gradient(
-    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
-    weights, members, g, gradient,
+def contributions(
+    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap, weights, groups,
+    cells_of, shares, scores,
 ):  # fmt: skip
-    """Add what the points ``members`` contribute to ``g`` (6,) and to ``gradient`` (ny, nx)."""
+    """Write where every point lands and what it adds to the gradients.
+
+    ``cells_of`` (n, 2) gets its cell (-1 where it does not count), ``shares`` (n, 3) its fractions
+    in the cell and its weighted residual. What it adds to the frame's own gradient goes to
+    ``scores`` (kinds, groups, 6), by its group in each row of ``groups`` (kinds, n).
+    """
     pose = _scalars(R, t, origin, spacing)
     cells = _inside(nodes, 0, 0, nodes.shape[1], nodes.shape[0])
-    for k in members:
+    for k in range(points.shape[0]):
+        cells_of[k, 0] = -1
         if weights[k] <= 0.0:
             continue
         on, x, y, a, b, qx, qy, qz, r, norm2, gx, gy = _residual(
-            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
-            along_ray, slope, front, cap,
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose,
+            cells, nodes, along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue
         wr = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2 * r
+        cells_of[k, 0], cells_of[k, 1] = x, y
+        shares[k, 0], shares[k, 1], shares[k, 2] = a, b, wr
         lx, ly, lz = qx + arm[0], qy + arm[1], qz + arm[2]
-        g[0] -= wr * gx
-        g[1] -= wr * gy
-        g[2] += wr
-        g[3] += wr * (ly + lz * gy)
-        g[4] += wr * (-lz * gx - lx)
-        g[5] += wr * (-lx * gy + ly * gx)
-        _apart(gradient, x, y, a, b, wr)
+        for kind in range(groups.shape[0]):
+            s = scores[kind, groups[kind, k]]
+            s[0] -= wr * gx
+            s[1] -= wr * gy
+            s[2] += wr
+            s[3] += wr * (ly + lz * gy)
+            s[4] += wr * (-lz * gx - lx)
+            s[5] += wr * (-lx * gy + ly * gx)
+
+
+@nb.njit(cache=True, nogil=True)
+def answered(cells_of, shares, groups, answer, left, low, scores):
+    """Add what the map's answer makes of the points' contributions to another frame's ``scores``.
+
+    ``answer`` (h, w, 6) is that frame's ``C^-1 B^T`` over the window from node (left, low) on; the
+    rest is as :func:`contributions` wrote it.
+    """
+    height, width = answer.shape[0], answer.shape[1]
+    for k in range(cells_of.shape[0]):
+        x, y = cells_of[k, 0] - left, cells_of[k, 1] - low
+        if cells_of[k, 0] < 0 or x < 0 or y < 0 or x + 1 >= width or y + 1 >= height:
+            continue
+        a, b, wr = shares[k, 0], shares[k, 1], shares[k, 2]
+        h00, h10 = wr * (1 - a) * (1 - b), wr * a * (1 - b)
+        h01, h11 = wr * (1 - a) * b, wr * a * b
+        n00, n10, n01, n11 = answer[y, x], answer[y, x + 1], answer[y + 1, x], answer[y + 1, x + 1]
+        for m in range(6):
+            v = h00 * n00[m] + h10 * n10[m] + h01 * n01[m] + h11 * n11[m]
+            for kind in range(groups.shape[0]):
+                scores[kind, groups[kind, k], m] += v
 
 
 @nb.njit(cache=True, nogil=True)
@@ -310,8 +392,8 @@ def noise_gradient(
         if weights[k] <= 0.0:
             continue
         on, x, y, a, b, _, _, _, _, norm2, _, _ = _residual(
-            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
-            along_ray, slope, front, cap,
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose,
+            cells, nodes, along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue
@@ -336,8 +418,8 @@ def slope_noise(
         if weights[k] <= 0.0:
             continue
         on, x, y, a, b, qx, qy, qz, _, norm2, _, _ = _residual(
-            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose, cells, nodes,
-            along_ray, slope, front, cap,
+            np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2]), pose,
+            cells, nodes, along_ray, slope, front, cap,
         )  # fmt: skip
         if not on:
             continue

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,7 +173,7 @@ def linearise(
     C = Stencil.empty(grid.shape) if spare is None else spare.C
     g_map = np.empty(grid.shape) if spare is None else spare.g_map
     rough = workers.map(
-        lambda band: collect(
+        lambda band: kernels.collect(
             scratch.totals, state.heights, smooth, loss.smoothing, *band,
             C.own, C.right, C.up, C.up_right, C.up_left, g_map,
         ),
@@ -215,54 +214,3 @@ def _footprint(
         # room to grow by a few nodes each way as the pose moves
         memory = np.empty((shape[0] + 8) * (shape[1] + 8) * 6)
     return Footprint(int(y0), int(x0), memory[: int(np.prod(shape))].reshape(shape), memory)
-
-
-@nb.njit(cache=True, nogil=True)
-def collect(
-    totals, heights, smooth, weight, first, last, own, right, up, up_right, up_left, gradient
-):  # type: ignore[no-untyped-def]
-    """Sum the threads' stencils ``totals`` (threads, ny, nx, 6) over the rows ``first`` to ``last``.
-
-    Adds the smoothing term, ``weight`` times the squared difference of neighbouring heights where
-    both are ``smooth``, and returns its cost. Nodes that nothing touches stay what they are: they
-    get a diagonal of 1.
-    """
-    ny, nx = heights.shape
-    cost = 0.0
-    for y in range(first, last):
-        for x in range(nx):
-            o, r, u, d, a, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(totals.shape[0]):
-                node = totals[k, y, x]
-                o += node[0]
-                r += node[1]
-                u += node[2]
-                d += node[3]
-                a += node[4]
-                g += node[5]
-            if smooth[y, x]:
-                if x + 1 < nx and smooth[y, x + 1]:
-                    e = heights[y, x] - heights[y, x + 1]
-                    o += weight
-                    r -= weight
-                    g += weight * e
-                    cost += weight * e * e
-                if y + 1 < ny and smooth[y + 1, x]:
-                    e = heights[y, x] - heights[y + 1, x]
-                    o += weight
-                    u -= weight
-                    g += weight * e
-                    cost += weight * e * e
-                if x > 0 and smooth[y, x - 1]:
-                    o += weight
-                    g += weight * (heights[y, x] - heights[y, x - 1])
-                if y > 0 and smooth[y - 1, x]:
-                    o += weight
-                    g += weight * (heights[y, x] - heights[y - 1, x])
-            own[y, x] = o if o > 0.0 else 1.0
-            right[y, x] = r
-            up[y, x] = u
-            up_right[y, x] = d
-            up_left[y, x] = a
-            gradient[y, x] = g
-    return cost

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.optimiser import certainty
+from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import average, near
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, State
@@ -18,8 +18,9 @@ from depthba.result import FrameReport, Iteration, Status
 
 
 def verdict(
-    outcome: Outcome, better: bool, judged: certainty.Certainty, frames: tuple[FrameReport, ...]
-) -> tuple[Status, str]:
+    outcome: Outcome, better: bool, judged: certainty.Certainty, frames: tuple[FrameReport, ...],
+    clock: Clock,
+) -> tuple[Status, str]:  # fmt: skip
     """Say how the registration ended, in one word and one sentence."""
     if not better:
         return "no_better", "no poses better than the start were found; the start is returned"
@@ -33,23 +34,25 @@ def verdict(
                 "to the measured poses"
             )
         return "weak", "; ".join(parts)
+    if not outcome.converged and clock.over:
+        return "not_converged", f"the time limit of {clock.limit:g} s ended the iterations"
     if not outcome.converged:
         return "not_converged", "the iterations ended before the poses settled"
     return "converged", "the poses settled"
 
 
 def frame_reports(
-    dataset: Dataset, problem: Problem, state: State, lin: Linearisation, held: list[str],
+    ids: tuple[int, ...], problem: Problem, state: State, lin: Linearisation, held: list[str],
     overlap: NDArray[np.float64],
 ) -> tuple[FrameReport, ...]:  # fmt: skip
     """Say how each frame fared; ``held`` gives the reason why a frame did not move, or is empty."""
     moved = se3.difference(state.T_map_camera, problem.T_map_camera)
     reports = []
-    for i, frame in enumerate(dataset):
+    for i, frame_id in enumerate(ids):
         weights = lin.weights[i]
         reports.append(
             FrameReport(
-                frame=frame.id,
+                frame=frame_id,
                 points=len(problem.frames[i]),
                 overlap=float(np.delete(overlap[i], i).max(initial=0.0)),
                 inliers=float((weights > 0.5).mean()) if len(weights) else 0.0,

@@ -14,9 +14,9 @@ from depthba.options import Options
 
 # Slope that noise alone may put into the map: above it the gradient, and with it the poses, are
 # biased.
-NOISE_SLOPE = 0.04
-# The finest map's spacing, in point spacings, where noise allows: finer gains nothing but cells that
-# one point decides.
+NOISE_SLOPE = 0.05
+# The finest map's spacing, in point spacings, where noise allows: any finer, and single points
+# decide a cell.
 FINEST = 1.2
 # The coarsest cells are this many times the distance by which the start poses may displace a point.
 REACH = 1.5
@@ -62,7 +62,7 @@ def check(options: Options) -> None:
     """
     if options.preset not in PRESETS:
         raise OptionError(f"--preset {options.preset}: expected one of {', '.join(PRESETS)}")
-    for name in ("resolution", "prior_t", "prior_r"):
+    for name in ("resolution", "prior_t", "prior_r", "time_limit"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):
             raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected a number above 0")
@@ -87,7 +87,9 @@ def finest_spacing(problem: Problem) -> float:
         return 4 * problem.spacing
     area = float(np.prod(problem.upper - problem.lower))
     density = sum(len(f) for f in problem.frames) / max(area, 1e-12)
-    return max(FINEST * problem.spacing, float(np.sqrt(problem.noise / NOISE_SLOPE / np.sqrt(density))))
+    return max(
+        FINEST * problem.spacing, float(np.sqrt(problem.noise / NOISE_SLOPE / np.sqrt(density)))
+    )
 
 
 def spacings(

@@ -21,11 +21,11 @@ from depthba.optimiser.linearise import (
     Linearisation,
     Loss,
     State,
-    Workers,
     fronts_of,
     robust_sigma,
 )
 from depthba.optimiser.problem import Problem
+from depthba.optimiser.workers import Workers
 
 # Where noise adds less than this share in every direction, it is not worth the solves.
 SLIGHT = 0.02

@@ -22,7 +22,6 @@ from depthba.optimiser.problem import Problem
 from depthba.optimiser.stencil import MapSolver
 from depthba.optimiser.workers import Workers
 
-
 # Factor by which steps are taken to shrink before two of them say more.
 PACE = 0.5
 
@@ -107,6 +106,7 @@ def solve_level(
     workers: Workers,
     report: Callable[[Progress], None],
     near: NDArray[np.float64] | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> Outcome:
     """Iterate to convergence on one grid with one loss.
 
@@ -124,6 +124,7 @@ def solve_level(
         workers: the threads.
         report: called after each iteration.
         near: (6N, 6N) the reduced matrix about where the level starts, if known.
+        over: asked before each iteration but the first whether to end.
     """
     lin = linearise(problem, grid, state, replace(loss, robust_c=0.0), workers, smooth)
     sigma = robust_sigma(lin.residuals)
@@ -134,7 +135,9 @@ def solve_level(
     damping, converged = 0.0, False
     dof = 6 * max(int(free.sum()), 1)
     mixer, pace, previous = Mixer(), PACE, np.inf
-    for _ in range(rules.limit):
+    for count in range(rules.limit):
+        if count and over():
+            break
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
         here = eliminate.reduce(lin, workers) if eliminate.direct_is_shorter(lin) else None

@@ -198,7 +198,7 @@ class MapSolver:
         while rr > goal and n < limit:
             n += 1
             self._map(
-                lambda *band, p=p, spare=spare, beta=beta: _direct(  # type: ignore[misc]
+                lambda *band, p=p, spare=spare, beta=beta: _direct(
                     self._couplings, 0, 0, r, beta, p, spare, q, sums, *band
                 )
             )
@@ -207,9 +207,7 @@ class MapSolver:
             if not curvature > 0.0:
                 break
             alpha = rr / curvature
-            self._map(
-                lambda *band, p=p, alpha=alpha: _advance(alpha, p, q, x, r, sums, *band)  # type: ignore[misc]
-            )
+            self._map(lambda *band, p=p, alpha=alpha: _advance(alpha, p, q, x, r, sums, *band))
             before, rr = rr, float(sums.sum())
             beta = rr / before
         return self._scale * x, n

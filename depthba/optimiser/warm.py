@@ -7,9 +7,10 @@ import numpy as np
 from depthba.optimiser import certainty, eliminate
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.layers import down_weighted
-from depthba.optimiser.linearise import Loss, State, Workers, linearise
+from depthba.optimiser.linearise import Loss, State, linearise
 from depthba.optimiser.prior import pose_prior
 from depthba.optimiser.problem import FramePoints, Problem
+from depthba.optimiser.workers import Workers
 
 
 def warm() -> None:

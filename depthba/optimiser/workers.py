@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.errors import Cancelled
 from depthba.optimiser.problem import Problem
 
 T = TypeVar("T")
@@ -34,16 +36,34 @@ class Workers:
     One pass at a time: the scratch memory is shared.
     """
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, threads: int, cancel: Callable[[], bool] | None = None) -> None:
+        """Start the threads.
+
+        Args:
+            threads: how many.
+            cancel: asked before every piece of work; when True, it raises :class:`Cancelled`.
+        """
         self.threads = threads
+        self._cancel = cancel
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._scratch: Scratch | None = None
 
     def map(self, function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
         """Return the results in the order of the items."""
+        if self._cancel is not None:
+            function = self._stoppable(function, self._cancel)
         if self._pool is None:
             return list(map(function, *items))
         return list(self._pool.map(function, *items))
+
+    @staticmethod
+    def _stoppable(function: Callable[..., T], cancel: Callable[[], bool]) -> Callable[..., T]:
+        def guarded(*arguments: Any) -> T:
+            if cancel():
+                raise Cancelled("the registration was cancelled")
+            return function(*arguments)
+
+        return guarded
 
     def close(self) -> None:
         """End the threads and let go of the memory."""
@@ -68,7 +88,7 @@ class Workers:
         """Deal the rows of a grid out: first row and the one past the last."""
         count = max(1, min(self.threads, rows // LEAST_ROWS))
         ends = [rows * k // count for k in range(count + 1)]
-        return list(zip(ends[:-1], ends[1:], strict=True))
+        return list(pairwise(ends))
 
     def scratch(self, shape: tuple[int, int], parts: int) -> Scratch:
         """Return memory for a pass over a grid of ``shape``; its values are not set."""

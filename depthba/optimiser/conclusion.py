@@ -1,0 +1,95 @@
+"""The end of a registration: is it better than the start, how certain is it, what came of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from depthba import se3
+from depthba.optimiser import certainty
+from depthba.optimiser.engine import End, Engine
+from depthba.optimiser.grid import average, filled
+from depthba.optimiser.linearise import State, linearise
+from depthba.optimiser.reporting import depth_map, frame_reports, verdict
+from depthba.optimiser.slope_noise import without_slope_noise
+from depthba.optimiser.solver import solve_map
+from depthba.result import Result
+
+# Rounds in which the start poses get the map that suits them best, and how exactly.
+ROUNDS, TOLERANCE = 3, 1e-3
+
+
+def conclude(
+    engine: Engine,
+    end: End,
+    ids: tuple[int, ...],
+    stamps: tuple[float, ...],
+    start: NDArray[np.float64],
+    held: list[str],
+    overlap: NDArray[np.float64],
+) -> Result:
+    """Compare with the start, say how certain the outcome is, and put the result together.
+
+    Args:
+        engine: that ran the levels.
+        end: where they ended.
+        ids: of the frames.
+        stamps: of the frames, s.
+        start: (N, 4, 4) T_world_camera.
+        held: per frame, why it did not move; empty where it did.
+        overlap: (N, N).
+    """
+    problem, level, outcome, workers = engine.problem, end.level, end.outcome, engine.workers
+    prior, T_camera_start = engine.prior, engine.problem.T_map_camera
+    averages = average(problem, T_camera_start, level.grid)
+    began, began_lin = solve_map(
+        level.problem, level.grid, State(T_camera_start, filled(averages.heights)),
+        outcome.loss, level.smooth, workers, ROUNDS, TOLERANCE,
+    )  # fmt: skip
+    outcome_lin = linearise(
+        level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth
+    )
+    acting = engine.acting
+    cost_start = began_lin.cost + end.temperature * acting.cost(T_camera_start)
+    cost_end = outcome_lin.cost + end.temperature * acting.cost(outcome.state.T_map_camera)
+    better = cost_end <= cost_start
+    state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
+    engine.clock.lap("compare with the start")
+    sigma = certainty.noise_sigma(level.problem, level.grid, state, outcome.loss, lin)
+    known = end.known
+    if not better:
+        known = certainty.correlation(
+            level.problem, level.grid, state, outcome.loss, lin, prior, engine.free, workers
+        )
+    variance = known.inflation * sigma**2
+    S = without_slope_noise(
+        level.problem, level.grid, state, outcome.loss, lin, known.S,
+        variance * block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0]),
+        engine.free, workers, sigma,
+    )  # fmt: skip
+    judged = certainty.assess(
+        level.problem, state, lin, S, variance, prior, engine.preset.prior, engine.free, ids
+    )
+    engine.clock.lap("certainty")
+    frames = frame_reports(ids, problem, state, lin, held, overlap)
+    status, reason = verdict(outcome, better, judged, frames, engine.clock)
+    T_world_map = se3.inverse(problem.T_map_world)
+    return Result(
+        status=status,
+        reason=reason,
+        frame_ids=ids,
+        stamps=stamps,
+        T_world_camera=T_world_map @ state.T_map_camera if better else start,
+        T_world_camera_start=start,
+        depth_map=depth_map(problem, level, state, lin, sigma),
+        depth_map_start=depth_map(problem, level, began, began_lin, sigma),
+        covariance=judged.covariance,
+        sigma=sigma,
+        inflation=known.inflation,
+        history=tuple(engine.history),
+        weak=judged.weak,
+        frames=frames,
+        seconds={**engine.clock.stages, "total": engine.clock.elapsed},
+        overlap=overlap,
+    )

@@ -1,0 +1,189 @@
+"""Runs the levels, coarse to fine, each from where the last one ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser import certainty, eliminate, schedule
+from depthba.optimiser.clock import Clock
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.level import Level, level_heights, make_level
+from depthba.optimiser.linearise import Linearisation, State, robust_sigma
+from depthba.optimiser.prior import PosePrior
+from depthba.optimiser.problem import Problem
+from depthba.optimiser.reporting import iteration
+from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
+from depthba.optimiser.workers import Workers
+from depthba.options import Options
+from depthba.result import Iteration
+
+# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the
+# rest is not.
+WIDE = 12.0
+# A level that only leads to the next is left when a step gains less than this share of its cost.
+GAIN = 0.02
+# Where the estimate owes the measured poses less than this in every direction, their exact weight
+# is of no account.
+NEGLIGIBLE = 0.002
+# What may be left to go where a level ends, in standard deviations of the poses: the last, others.
+SETTLED, PASSING = 0.03, 0.1
+# Tolerance of a reduced matrix that only has to be near the one it preconditions.
+NEAR = 1e-2
+# Times that the last level goes on when the residuals turn out less correlated than was thought.
+AGAIN = 2
+
+
+@dataclass(frozen=True)
+class Map:
+    """Heights and the grid that they stand on."""
+
+    heights: NDArray[np.float64]
+    grid: Grid
+
+
+@dataclass(frozen=True)
+class End:
+    """Where the last level ended, and what is known there."""
+
+    level: Level
+    outcome: Outcome
+    temperature: float
+    """m^2, what a squared normalised error of a measured pose cost."""
+    known: certainty.Correlation
+    """At the outcome."""
+
+
+@dataclass
+class Engine:
+    """What stays the same through all levels."""
+
+    problem: Problem
+    options: Options
+    prior: PosePrior
+    """The measured poses, whether or not they take part."""
+    free: NDArray[np.bool_]
+    """(N,), frames that move."""
+    workers: Workers
+    clock: Clock
+    callback: Callable[[Iteration], None] = lambda _: None
+    settled: float = SETTLED
+    history: list[Iteration] = field(default_factory=list)
+
+    @property
+    def preset(self) -> schedule.Preset:
+        """What the options' preset fixes."""
+        return schedule.PRESETS[self.options.preset]
+
+    @property
+    def acting(self) -> PosePrior:
+        """The prior as it enters the cost: nothing where the preset leaves it out."""
+        if self.preset.prior:
+            return self.prior
+        return replace(self.prior, information=0 * self.prior.information)
+
+    def run(
+        self, levels: list[float], poses: NDArray[np.float64], before: Map | None = None
+    ) -> End:
+        """Run levels of the given spacings, m, from poses (N, 4, 4) ``T_map_camera``.
+
+        ``before`` is a map to start from in place of the points' averages.
+        """
+        known: certainty.Correlation | None = None
+        for index, spacing in enumerate(levels):
+            last = index == len(levels) - 1 or self.clock.over
+            level = make_level(self.problem, poses, spacing, self.preset, self.options, last)
+            heights = level_heights(
+                level, before.heights if before else None, before.grid if before else None
+            )
+            state, lin = solve_map(
+                level.problem, level.grid, State(poses, heights), level.loss, level.smooth,
+                self.workers, 1, NEAR,
+            )  # fmt: skip
+            for phase in phases(index if before is None else 1, self.preset):
+                near = eliminate.reduce(lin, self.workers, NEAR)
+                if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
+                    known = self._correlation(level, state, lin, near)
+                believed = known.inflation if known else 1.0
+                temperature = believed * robust_sigma(lin.residuals) ** 2 if known else 0.0
+                final = last and phase == phases(1, self.preset)[-1]
+                outcome = self._solve(
+                    level, state, phase, index, len(levels), temperature, believed, near.S, final
+                )
+                state, lin = outcome.state, outcome.lin
+                self.clock.lap(f"level {index} {phase}")
+            if last:
+                break
+            poses, before = state.T_map_camera, Map(state.heights, level.grid)
+        found = self._conclude(level, outcome)
+        for _ in range(AGAIN):
+            if not outcome.converged or found.inflation > 0.5 * believed:
+                break
+            believed = found.inflation
+            outcome = self._solve(
+                level, outcome.state, phase, index, len(levels), temperature, believed, found.S,
+                True,
+            )  # fmt: skip
+            self.clock.lap(f"level {index} {phase}")
+            found = self._conclude(level, outcome)
+        return End(level, outcome, temperature, found)
+
+    def _solve(
+        self, level: Level, state: State, phase: str, index: int, count: int, temperature: float,
+        believed: float, near: NDArray[np.float64], final: bool,
+    ) -> Outcome:  # fmt: skip
+        rules = Rules(
+            _scale(self.preset, phase),
+            self.options.max_iterations,
+            settled=self.settled if final else PASSING,
+            gain=0.0 if final else GAIN,
+            believed=believed,
+        )
+
+        def report(p: Progress) -> None:
+            self.history.append(
+                iteration(
+                    p, level, index, count, phase, len(self.history), self.problem,
+                    self.clock.elapsed,
+                )
+            )  # fmt: skip
+            self.callback(self.history[-1])
+
+        return solve_level(
+            level.problem, level.grid, state, level.loss, rules, self.acting, temperature,
+            self.free, level.smooth, self.workers, report, near, lambda: self.clock.over,
+        )  # fmt: skip
+
+    def _correlation(
+        self, level: Level, state: State, lin: Linearisation, at: eliminate.Reduction
+    ) -> certainty.Correlation:
+        return certainty.correlation(
+            level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,
+            at,
+        )  # fmt: skip
+
+    def _conclude(self, level: Level, outcome: Outcome) -> certainty.Correlation:
+        at = eliminate.reduce(outcome.lin, self.workers)
+        found = self._correlation(level, outcome.state, outcome.lin, at)
+        self.clock.lap("certainty")
+        return found
+
+
+def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
+    """Return the losses of a level.
+
+    The robust one comes only when the poses have settled under a wide one.
+    """
+    if not preset.robust:
+        return ("quadratic",)
+    return ("quadratic", "robust") if index == 0 else ("robust",)
+
+
+def _scale(preset: schedule.Preset, phase: str) -> float:
+    """Return the robust scale of a phase, in robust standard deviations; 0 without such a loss."""
+    if not preset.robust:
+        return 0.0
+    return preset.robust if phase == "robust" else WIDE
