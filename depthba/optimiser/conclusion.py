@@ -63,7 +63,7 @@ def conclude(
             level.problem, level.grid, state, outcome.loss, lin, prior, engine.free, workers
         )
     variance = known.inflation * sigma**2
-    S = without_slope_noise(
+    S, _ = without_slope_noise(
         level.problem, level.grid, state, outcome.loss, lin, known.S,
         variance * block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0]),
         engine.free, workers, sigma,

@@ -282,6 +282,7 @@ def solve(
     outer: int,
     near: NDArray[np.float64] | None = None,
     here: Reduction | None = None,
+    sure: NDArray[np.float64] | None = None,
 ) -> Step:
     """Solve the damped normal equations.
 
@@ -298,13 +299,21 @@ def solve(
         near: (6N, 6N) reduced matrix from earlier in the level: the preconditioner, in place of the
             lumped one.
         here: the reduction of ``lin`` itself: the direct road.
+        sure: (6N, 6N) what of ``near`` is not noise in the map's slope, S0. A gradient g that is
+            ``-S0 x`` but for noise of covariance S says ``S0 S^-1 S0`` about x, through
+            ``S0 S^-1 g``: where noise is all there is, the measured poses stand.
     """
     n = len(lin.B)
     inner = min(1e-3, 0.1 * tolerance)
     solver = MapSolver(lin.C, inner, workers)
     answer, _ = solver.solve(-lin.g_map, inner)
-    g = lin.g_pose + gather(lin, answer, workers) + prior[1]
+    g = lin.g_pose + gather(lin, answer, workers)
     keep = np.repeat(free, 6)
+    if sure is not None and near is not None:
+        steps, length = _held_step(g.ravel()[keep], prior, near, sure, keep, damping)
+        back, _ = solver.solve(spread(lin, steps, workers), inner)
+        return Step(steps, answer - back, length)
+    g = g + prior[1]
     S = here.S if here is not None else near if near is not None else lumped(lin, workers)
     extra = np.zeros_like(S)
     for i in range(n):
@@ -338,6 +347,25 @@ def solve(
     if outer == 0:
         back, _ = solver.solve(spread(lin, whole(x), workers), inner)
     return Step(whole(x), answer - back, float(x @ Sx))
+
+
+def _held_step(g, prior, S, sure, keep, damping):
+    """Return the step (N, 6) that noise in the map's slope does not drive, and its length."""
+    n = len(keep) // 6
+    extra = np.zeros_like(S)
+    for i in range(n):
+        extra[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = prior[0][i]
+    window = np.ix_(keep, keep)
+    ridge = 1e-9 * np.diag(np.diag(S[window]) + np.max(np.diag(S[window]), initial=1e-300) * 1e-3)
+    through = np.linalg.solve(S[window] + ridge, sure[window]).T
+    bound = through @ sure[window]
+    bound = (bound + bound.T) / 2 + extra[window]
+    floor = 1e-12 * np.max(np.diag(bound), initial=1e-300)
+    factor = _factor(bound + np.diag(damping * np.diag(bound) + floor), floor)
+    x = -cho_solve(factor, through @ g + prior[1].ravel()[keep])
+    steps = np.zeros(6 * n)
+    steps[keep] = x
+    return steps.reshape(n, 6), float(x @ bound @ x)
 
 
 def _factor(matrix, floor):

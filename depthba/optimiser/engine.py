@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from depthba.optimiser import certainty, eliminate, schedule
 from depthba.optimiser.clock import Clock
@@ -16,6 +17,7 @@ from depthba.optimiser.linearise import Linearisation, State, robust_sigma
 from depthba.optimiser.prior import PosePrior
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
+from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
@@ -33,6 +35,10 @@ NEGLIGIBLE = 0.002
 SETTLED, PASSING = 0.03, 0.1
 # Tolerance of a reduced matrix that only has to be near the one it preconditions.
 NEAR = 1e-2
+# Share of noise in what the data say about any direction from which on steps are guarded against it.
+NOISY = 0.1
+# That share grows from a level to the next by less than this.
+FINER = 4.0
 # Times that the last level goes on when the residuals turn out less correlated than was thought.
 AGAIN = 2
 
@@ -71,6 +77,8 @@ class Engine:
     clock: Clock
     callback: Callable[[Iteration], None] = lambda _: None
     settled: float = SETTLED
+    noisy: float = 1.0
+    """Largest share of noise in what the data said about a direction, when last measured."""
     history: list[Iteration] = field(default_factory=list)
 
     @property
@@ -109,9 +117,11 @@ class Engine:
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
                 temperature = believed * robust_sigma(lin.residuals) ** 2 if known else 0.0
+                sure = self._sure(level, state, lin, near.S, temperature)
                 final = last and phase == phases(1, self.preset)[-1]
                 outcome = self._solve(
-                    level, state, phase, index, len(levels), temperature, believed, near.S, final
+                    level, state, phase, index, len(levels), temperature, believed, near.S, sure,
+                    final,
                 )
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
@@ -125,6 +135,9 @@ class Engine:
             believed = found.inflation
             outcome = self._solve(
                 level, outcome.state, phase, index, len(levels), temperature, believed, found.S,
+                None if sure is None else self._sure(
+                    level, outcome.state, outcome.lin, found.S, temperature
+                ),
                 True,
             )  # fmt: skip
             self.clock.lap(f"level {index} {phase}")
@@ -133,7 +146,7 @@ class Engine:
 
     def _solve(
         self, level: Level, state: State, phase: str, index: int, count: int, temperature: float,
-        believed: float, near: NDArray[np.float64], final: bool,
+        believed: float, near: NDArray[np.float64], sure: NDArray[np.float64] | None, final: bool,
     ) -> Outcome:  # fmt: skip
         rules = Rules(
             _scale(self.preset, phase),
@@ -154,8 +167,23 @@ class Engine:
 
         return solve_level(
             level.problem, level.grid, state, level.loss, rules, self.acting, temperature,
-            self.free, level.smooth, self.workers, report, near, lambda: self.clock.over,
+            self.free, level.smooth, self.workers, report, near, sure,
+            lambda: self.clock.over,
         )  # fmt: skip
+
+    def _sure(
+        self, level: Level, state: State, lin: Linearisation, S: NDArray[np.float64],
+        temperature: float,
+    ) -> NDArray[np.float64] | None:  # fmt: skip
+        """Return what of S is not noise in the map's slope; None where that is next to all."""
+        if not self.preset.prior or self.noisy * FINER < NOISY:
+            return None
+        matrix, _ = self.prior.normal_equations(state.T_map_camera, lin.pivots)
+        less, self.noisy = without_slope_noise(
+            level.problem, level.grid, state, level.loss, lin, S, temperature * block_diag(*matrix),
+            self.free, self.workers, share=NOISY,
+        )  # fmt: skip
+        return None if less is S else less
 
     def _correlation(
         self, level: Level, state: State, lin: Linearisation, at: eliminate.Reduction

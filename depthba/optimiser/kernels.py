@@ -255,7 +255,7 @@ def accumulate(
 def collect(
     totals, heights, smooth, weight, first, last, own, right, up, up_right, up_left, gradient
 ):  # fmt: skip
-    """Sum the threads' stencils ``totals`` (threads, ny, nx, 6) over some rows.
+    """Sum the stencils ``totals`` (parts, ny, nx, 6) over some rows.
 
     Rows ``first`` to ``last``. Adds the smoothing term, ``weight`` times the squared difference of
     neighbouring heights where both are ``smooth``, and returns its cost. Nodes that nothing touches

@@ -32,6 +32,8 @@ SLIGHT = 0.02
 # What the data say counts as far as it exceeds this many times what noise alone would: what noise
 # truly put in scatters about what a draw of it would have.
 MARGIN = 2.0
+# Tolerance of the solves: a draw of noise need not be eliminated exactly.
+ROUGHLY = 0.1
 
 
 def without_slope_noise(
@@ -45,8 +47,11 @@ def without_slope_noise(
     free: NDArray[np.bool_],
     workers: Workers,
     sigma: float | None = None,
-) -> NDArray[np.float64]:
+    share: float = SLIGHT,
+) -> tuple[NDArray[np.float64], float]:
     """Return the exact reduced matrix S (6N, 6N) less what noise in the map's slope put into it.
+
+    And the largest share of noise in any direction, or a bound of it.
 
     Args:
         problem: the points.
@@ -59,6 +64,7 @@ def without_slope_noise(
         free: (N,) frames that moved.
         workers: the threads.
         sigma: standard deviation of the points' noise, m; None: of their residuals.
+        share: of noise in any direction, below which S itself is returned.
     """
     variance = (robust_sigma(lin.residuals) if sigma is None else sigma) ** 2
     noisy = _noise_linearisation(problem, grid, state, loss, lin, workers)
@@ -67,12 +73,18 @@ def without_slope_noise(
     for i in range(n):
         bound[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = variance * noisy.A[i]
     keep = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
-    if not free.any() or _largest_share(bound[keep], (S + held)[keep]) < SLIGHT:
-        return S
+    if not free.any():
+        return S, 0.0
+    found = _largest_share(bound[keep], (S + held)[keep])
+    if found < share:
+        return S, found
+    noise = variance * eliminate.exact(noisy, workers, ROUGHLY)
+    found = _largest_share(noise[keep], (S + held)[keep])
+    if found < share:
+        return S, found
     out = S.copy()
-    noise = variance * eliminate.exact(noisy, workers, 1e-3)
     out[keep] = _less(S[keep], MARGIN * noise[keep], held[keep])
-    return out
+    return out, found
 
 
 def _largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:

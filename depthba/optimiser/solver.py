@@ -106,6 +106,7 @@ def solve_level(
     workers: Workers,
     report: Callable[[Progress], None],
     near: NDArray[np.float64] | None = None,
+    sure: NDArray[np.float64] | None = None,
     over: Callable[[], bool] = lambda: False,
 ) -> Outcome:
     """Iterate to convergence on one grid with one loss.
@@ -124,6 +125,7 @@ def solve_level(
         workers: the threads.
         report: called after each iteration.
         near: (6N, 6N) the reduced matrix about where the level starts, if known.
+        sure: (6N, 6N) what of it is not noise in the map's slope; None: all of it.
         over: asked before each iteration but the first whether to end.
     """
     lin = linearise(problem, grid, state, replace(loss, robust_c=0.0), workers, smooth)
@@ -134,15 +136,18 @@ def solve_level(
         lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
     damping, converged = 0.0, False
     dof = 6 * max(int(free.sum()), 1)
+    # a direction that goes back to its measured pose gives up what it had gained from noise
+    unlearnt = 0.0 if sure is None else dof * max(temperature, sigma**2)
     mixer, pace, previous = Mixer(), PACE, np.inf
     for count in range(rules.limit):
         if count and over():
             break
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
-        here = eliminate.reduce(lin, workers) if eliminate.direct_is_shorter(lin) else None
+        direct = sure is None and eliminate.direct_is_shorter(lin)
+        here = eliminate.reduce(lin, workers) if direct else None
         step = eliminate.solve(
-            lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here
+            lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here, sure
         )
         length = float(np.sqrt(max(step.decrement, 0.0)))
         metric = here.S if here is not None else near
@@ -158,7 +163,7 @@ def solve_level(
         deviation = np.sqrt(dof * max(rules.believed * sigma**2, 1e-30))
         small = left < rules.settled * deviation
         # with the nodal gradient the cost may rise in the last digits while the poses still settle
-        accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6))
+        accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6)) + unlearnt
         if accepted:
             pace = min(max(0.5 * (pace + length / previous), 0.1), 0.9)
             previous = length

@@ -18,6 +18,8 @@ T = TypeVar("T")
 
 # Rows of a grid below which a second thread costs more than it saves.
 LEAST_ROWS = 64
+# Runs of frames that are summed apart: each needs a map's memory.
+SHARES = 4
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Scratch:
     nodes: NDArray[np.float64]
     """(ny, nx, 3), heights and gradients."""
     totals: NDArray[np.float64]
-    """(threads, ny, nx, 6), stencil and gradient of the map by thread."""
+    """(parts, ny, nx, 6), stencil and gradient of the map by run of frames."""
 
 
 class Workers:
@@ -71,16 +73,18 @@ class Workers:
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def shares(self, problem: Problem) -> list[range]:
-        """Deal the frames out in runs of about equal numbers of points."""
+    @staticmethod
+    def shares(problem: Problem) -> list[range]:
+        """Deal the frames out in runs of about equal numbers of points.
+
+        As many whatever the number of threads: so the sums are the same to the last bit.
+        """
         sizes = np.array([len(f) for f in problem.frames], dtype=float)
         ends = np.cumsum(sizes) - sizes / 2
-        share = np.minimum(
-            (ends / max(sizes.sum(), 1) * self.threads).astype(int), self.threads - 1
-        )
+        share = np.minimum((ends / max(sizes.sum(), 1) * SHARES).astype(int), SHARES - 1)
         return [
             range(int(np.flatnonzero(share == k)[0]), int(np.flatnonzero(share == k)[-1]) + 1)
-            for k in range(self.threads)
+            for k in range(SHARES)
             if (share == k).any()
         ]
 

@@ -120,7 +120,6 @@ def test_any_world_frame_gives_the_same_poses(two_worlds: tuple[Result, Result])
     )
 
 
-@pytest.mark.xfail(reason="the prior keeps the weight it had before the poses settled")
 def test_start_does_not_matter(scene: Dataset, result: Result, tmp_path: Path) -> None:
     truth = truth_of(scene)
     write_tum(tmp_path / "truth.txt", np.asarray(scene.stamps), truth)
