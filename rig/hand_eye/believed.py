@@ -92,3 +92,17 @@ def posterior(H: Array, g: Array, now: Array, variance: Array) -> tuple[Array, A
     covariance = scale[:, None] * inner * scale
     step = -covariance @ (g + now / variance)
     return step, (covariance + covariance.T) / 2
+
+
+def newton_step(derivative: Array, g: Array, now: Array, variance: Array) -> Array:
+    """Return the step (k,) to where the gradient g and the beliefs balance.
+
+    Args:
+        derivative: (k, k) of g by the unknowns; it need not be symmetric.
+        g: (k,), at the present values.
+        now: (k,) the present values.
+        variance: (k,) of the beliefs about 0.
+    """
+    scale = np.sqrt(variance)
+    inner = np.eye(len(now)) + scale[:, None] * derivative * scale
+    return np.asarray(-scale * np.linalg.solve(inner, scale * (g + now / variance)))

@@ -8,6 +8,7 @@ about the flange's origin along the base's.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ class Chain:
         """(N, 4, 4), corrected."""
         return np.asarray(self.T_map_flange @ self.T_flange_camera)
 
-    def moved(self, step: Array) -> Chain:
+    def moved(self, step: NDArray[np.floating[Any]]) -> Chain:
         """Return the chain after a step of X (6,), or of X, the zeros and the flanges.
 
         The step (6 + n + 6N,) is in that order.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +16,17 @@ from numpy.typing import NDArray
 from depthba import se3
 from depthba.optimiser import eliminate
 from depthba.optimiser.level import Level
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.solver import solve_map
+from depthba.optimiser.workers import Workers
 from rig.hand_eye.chain import Chain
 
 Array = NDArray[np.float64]
 
-# Converged when the step is below this many standard deviations (root mean square).
-SETTLED = 0.05
+# Enough when the step is below this many standard deviations (root mean square), or gains less than
+# this share of the cost: a level only has to bring what follows into reach.
+SETTLED = 0.1
+GAIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Iteration:
     """Of the map, m."""
     cost: float
     """Before the step, m^2."""
-    step: Array
+    step: NDArray[np.floating[Any]]
     """(6,) of X, m and rad."""
     accepted: bool
     sigma: float
@@ -66,7 +70,6 @@ class Descent:
     heights: Array
     loss: Loss
     lin: Linearisation
-    converged: bool
 
 
 def descend(
@@ -78,9 +81,8 @@ def descend(
     limit: int,
     workers: Workers,
     report: Callable[[Iteration], None],
-    gain: float = 0.0,
 ) -> Descent:
-    """Iterate X and the map to convergence.
+    """Iterate X and the map until they hardly gain.
 
     Args:
         level: the points and the grid.
@@ -91,7 +93,6 @@ def descend(
         limit: most iterations.
         workers: the threads.
         report: called after each iteration.
-        gain: enough when a step lowers the cost by less than this share.
     """
 
     def at(chain: Chain, heights: Array, loss: Loss, judge: Loss | None = None) -> Linearisation:
@@ -100,16 +101,17 @@ def descend(
 
     plain = replace(level.loss, robust_c=0.0)
     state, lin = solve_map(
-        level.problem, level.grid, State(chain.T_map_camera, heights), plain, level.smooth, workers
-    )
+        level.problem, level.grid, State(chain.T_map_camera, heights), plain, level.smooth,
+        workers, 1, 1e-2,
+    )  # fmt: skip
     heights = state.heights
     sigma = robust_sigma(lin.residuals)
     loss = judge = _rescaled(level.loss, robust * sigma)
     lin = at(chain, heights, loss)
-    damping, converged = 0.0, False
+    damping = 0.0
     for _ in range(limit):
         temperature = sigma**2
-        answer, _ = lin.C.solve(-lin.g_map, 1e-5)
+        answer, _ = lin.C.solve(-lin.g_map, 1e-3)
         J = chain.by_hand_eye(lin.pivots)
         held = temperature / start.sigma**2
         gradient = J.T @ (lin.g_pose + eliminate.gather(lin, answer)).ravel()
@@ -133,12 +135,11 @@ def descend(
         else:
             damping = max(10 * damping, 1e-4)
         report(Iteration(level.grid.spacing, before_cost, x, accepted, sigma))
-        if accepted and (small or before_cost - after_cost < gain * before_cost):
-            converged = True
+        if accepted and (small or before_cost - after_cost < GAIN * before_cost):
             break
         if damping > 1e6:
             break
-    return Descent(chain, heights, loss, lin, converged)
+    return Descent(chain, heights, loss, lin)
 
 
 def responses(lin: Linearisation, J: Array, workers: Workers) -> tuple[Array, Array]:
@@ -147,7 +148,7 @@ def responses(lin: Linearisation, J: Array, workers: Workers) -> tuple[Array, Ar
 
     def one(column: Array) -> tuple[Array, Array]:
         pose = column.reshape(n, 6)
-        field, _ = lin.C.solve(eliminate.spread(lin, pose), 1e-5)
+        field, _ = lin.C.solve(eliminate.spread(lin, pose), 1e-3)
         product = np.einsum("nij,nj->ni", lin.A, pose) - eliminate.gather(lin, field)
         return field, product.ravel()
 

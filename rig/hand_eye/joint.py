@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from depthba.optimiser import certainty, eliminate
 from depthba.optimiser.level import Level
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.problem import BLOCKS
 from depthba.optimiser.slope_noise import without_slope_noise
-from rig.hand_eye.believed import Beliefs, estimate, posterior
+from depthba.optimiser.workers import Workers
+from rig.hand_eye.believed import Beliefs, estimate, newton_step
 from rig.hand_eye.chain import Chain
 from rig.hand_eye.descent import Descent, Iteration, Start
 from rig.hand_eye.pattern import Answers, Waves, answers
@@ -26,10 +27,16 @@ Array = NDArray[np.float64]
 
 # Rounds of strength and steps: the first strengths are found where the flanges are still as
 # reported.
-ROUNDS = 3
-STEPS = 12
-# Settled when a step of X is below this many of its standard deviations (root mean square).
-SETTLED = 0.03
+ROUNDS = 2
+STEPS = 20
+# Settled when the proposed step of X is below this many of its standard deviations (root mean
+# square), and by how much a step may raise the cost.
+SETTLED = 0.05
+SLACK = 1e-3
+# Steps that are mixed, and the coefficients above which their history is not that of a linear
+# process.
+DEPTH = 3
+WILD = 10.0
 
 
 @dataclass(frozen=True)
@@ -48,8 +55,8 @@ class Joint:
     variance."""
     sigma: float
     """Robust standard deviation of the residuals, m."""
-    cost: float
-    """Beliefs included, m^2."""
+    residuals: Array
+    """(N,) the same of each frame, m."""
     converged: bool
 
 
@@ -84,28 +91,32 @@ def solve(
         return linearise(points, level.grid, state, loss, workers, level.smooth)
 
     lin = at(chain, heights, pattern)
+    reply: Answers | None = None
     for _ in range(ROUNDS):
         here = replace(level, problem=waves.without(problem, pattern) if m else problem)
         state = State(chain.T_map_camera, heights)
-        temperature, inflation, S = _weigh(here, state, loss, lin, stated, workers)
-        reply = answers(here, state, loss, lin, waves, workers)
+        worth = _weigh(here, state, loss, lin, stated, workers)
+        if reply is None:  # hardly changes afterwards, and takes a pass for each wave
+            reply = answers(here, state, loss, lin, waves, workers)
         J = chain.jacobian(lin.pivots)
-        H = _information(J, S, reply) / temperature
-        _, gradient = _gradient(lin, J, reply, waves)
+        newton, H = _information(J, worth, reply)
+        _, gradient = _gradient(lin, J, worth, reply, waves)
         now = _unknowns(chain, start, pattern)
-        beliefs, _, covariance = estimate(H, gradient / temperature, now, stated, zeros, n, m)
+        beliefs, _, covariance = estimate(H, gradient, now, stated, zeros, n, m)
         variance = beliefs.variances(zeros, n, m)
 
-        def total(lin: Linearisation, chain: Chain, pattern: Array) -> float:
-            believed = _unknowns(chain, start, pattern) ** 2 / variance  # noqa: B023
-            return lin.cost / temperature + float(believed.sum())  # noqa: B023
+        def total(lin: Linearisation, now: Array, worth: Worth, variance: Array) -> float:
+            return lin.cost + worth.temperature * float((now**2 / variance).sum())
 
-        converged, length = False, 1.0
+        mixer, length, converged = Mixer(np.linalg.inv(covariance)), 1.0, False
         for _ in range(STEPS):
-            answer, gradient = _gradient(lin, J, reply, waves)
+            answer, gradient = _gradient(lin, J, worth, reply, waves)
             now = _unknowns(chain, start, pattern)
-            full, _ = posterior(H, gradient / temperature, now, variance)
-            step = length * full
+            full = newton_step(newton, gradient, now, variance)
+            converged = float(full[:6] @ np.linalg.solve(covariance[:6, :6], full[:6])) < (
+                6 * SETTLED**2
+            )
+            step = length * mixer.mix(full)
             moved, bent = chain.moved(step[: len(step) - m]), pattern + step[len(step) - m :]
             poses = (J @ step[: len(step) - m]).reshape(-1, 6)
             back, _ = lin.C.solve(eliminate.spread(lin, poses), 1e-4)
@@ -113,66 +124,128 @@ def solve(
             if m:
                 raised -= np.tensordot(step[len(step) - m :], reply.back, 1)
             after = at(moved, raised, bent)
-            before_cost, after_cost = total(lin, chain, pattern), total(after, moved, bent)
-            x = step[:6]
-            small = float(x @ np.linalg.solve(covariance[:6, :6], x)) < 6 * SETTLED**2
-            accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6))
+            before_cost = total(lin, now, worth, variance)
+            after_cost = total(after, _unknowns(moved, start, bent), worth, variance)
+            # what the map's noise is not believed does not show in the cost: it may rise a little
+            accepted = after_cost <= before_cost * (1 + SLACK)
             if accepted:
                 chain, heights, pattern, lin = moved, raised, bent, after
+                mixer.took(step)
                 length = min(1.0, 2 * length)
             else:
+                mixer.forget()
                 length /= 4
             sigma = robust_sigma(lin.residuals)
-            report(Iteration(level.grid.spacing, before_cost * temperature, x, accepted, sigma))
-            if accepted and small and length == 1.0:
-                converged = True
+            report(Iteration(level.grid.spacing, before_cost, step[:6], accepted, sigma))
+            if (accepted and converged) or length < 1e-3:
                 break
-            if length < 1e-3:
-                break
-    cost = temperature * total(lin, chain, pattern)
     sigma = robust_sigma(lin.residuals)
-    return Joint(chain, heights, pattern, beliefs, covariance, inflation, sigma, cost, converged)
+    each = np.array([robust_sigma((r,)) for r in lin.residuals])
+    return Joint(
+        chain, heights, pattern, beliefs, covariance, worth.inflation, sigma, each, converged
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What the depths are worth."""
+
+    temperature: float
+    """m^2, what a squared normalised belief costs."""
+    inflation: float
+    """Factor in it by which neighbours err alike."""
+    S: Array
+    """(6N, 6N) reduced matrix of the poses, less what noise in the map's slope put into it."""
+    believed: Array
+    """(6N, 6N) that takes a reduced gradient to what is left of it without that noise."""
+
+
+class Mixer:
+    """Anderson mixing (type II) of steps, which converge linearly under a robust loss."""
+
+    def __init__(self, metric: Array) -> None:
+        """``metric`` (k, k) compares steps."""
+        self._metric = metric
+        self._proposed: list[Array] = []
+        self._taken: list[Array] = []
+
+    def mix(self, step: Array) -> Array:
+        """Return the step to take in place of the proposed one (k,)."""
+        self._proposed = [*self._proposed, step][-DEPTH - 1 :]
+        m = min(len(self._proposed) - 1, len(self._taken))
+        if m == 0:
+            return step
+        D = np.diff(np.stack(self._proposed[-m - 1 :]), axis=0)
+        gram = D @ self._metric @ D.T
+        gram += (1e-8 * np.trace(gram) + 1e-300) * np.eye(m)
+        theta = np.linalg.solve(gram, D @ self._metric @ step)
+        if not np.abs(theta).sum() < WILD:
+            return step
+        return np.asarray(step - theta @ (np.stack(self._taken[-m:]) + D))
+
+    def took(self, step: Array) -> None:
+        """Remember a step that was taken."""
+        self._taken = [*self._taken, step][-DEPTH:]
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._proposed.clear()
+        self._taken.clear()
 
 
 def _unknowns(chain: Chain, start: Start, pattern: Array) -> Array:
     return np.concatenate([start.error(chain), chain.zeros, chain.missed.ravel(), pattern])
 
 
-def _information(J: Array, S: Array, reply: Answers) -> Array:
-    """Return the reduced matrix of all unknowns, map eliminated."""
-    cross = J.T @ reply.cross
-    return np.block([[J.T @ S @ J, cross], [cross.T, reply.own]])
+def _information(J: Array, worth: Worth, reply: Answers) -> tuple[Array, Array]:
+    """Return the derivative of the gradient by all unknowns, and their information."""
+    own = J.T @ worth.S @ J
+    cross = J.T @ worth.believed @ reply.cross
+    back = reply.cross.T @ J
+    newton = np.block([[own, cross], [back, reply.own]]) / worth.temperature
+    return newton, np.block([[own, cross], [cross.T, reply.own]]) / worth.temperature
 
 
-def _gradient(lin: Linearisation, J: Array, reply: Answers, waves: Waves) -> tuple[Array, Array]:
-    """Return the map's step for fixed unknowns (ny, nx), and the gradient with it."""
-    answer, _ = lin.C.solve(-lin.g_map, 1e-5)
-    pose = J.T @ (lin.g_pose + eliminate.gather(lin, answer)).ravel()
-    return answer, np.concatenate([pose, reply.gradient(waves, lin)])
+def _gradient(
+    lin: Linearisation, J: Array, worth: Worth, reply: Answers, waves: Waves
+) -> tuple[Array, Array]:
+    """Return the map's step for fixed unknowns (ny, nx), and the gradient with it (k,)."""
+    answer, _ = lin.C.solve(-lin.g_map, 1e-4)
+    pose = (lin.g_pose + eliminate.gather(lin, answer)).ravel()
+    gradient = np.concatenate([J.T @ (worth.believed @ pose), reply.gradient(waves, lin)])
+    return answer, gradient / worth.temperature
 
 
 def _weigh(
     level: Level, state: State, loss: Loss, lin: Linearisation, stated: Beliefs, workers: Workers
-) -> tuple[float, float, Array]:
-    """Return what a squared normalised belief costs, m^2, the inflation in it, and S (6N, 6N).
+) -> Worth:
+    """Find out what the depths are worth.
 
     Blocks of the image are dealt out to groups, each frame's in another way, and the scatter of the
     groups' gradients compared with that of as many groups of single points: so far as neighbours in
     one frame err alike, the former is larger. What all frames have in common is the pattern's.
     """
-    S = eliminate.exact(lin, workers, 1e-4)
+    reduction = eliminate.reduce(lin, workers)
+    S = reduction.S
     n = len(level.problem.frames)
     rng = np.random.default_rng(0)
     count = BLOCKS[0] * BLOCKS[1]
-    dealt = tuple(rng.permutation(count).astype(np.uint8)[f.blocks] for f in level.problem.frames)
-    single = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in level.problem.frames)
-    variance = robust_sigma(lin.residuals) ** 2
-    everywhere = np.ones(n, bool)
-    scores = [
-        certainty.block_scores(level.problem, level.grid, state, loss, lin, groups, workers)
-        for groups in (dealt, single)
+    groups = [
+        np.stack(
+            [
+                rng.permutation(count).astype(np.uint8)[f.blocks],
+                rng.integers(0, count, len(f)).astype(np.uint8),
+            ]
+        )
+        for f in level.problem.frames
     ]
-    scores = [s - s.mean(axis=0) for s in scores]
+    sigma = certainty.noise_sigma(level.problem, level.grid, state, loss, lin)
+    variance = sigma**2
+    everywhere = np.ones(n, bool)
+    scores = certainty.block_scores(
+        level.problem, level.grid, state, loss, lin, groups, workers, reduction
+    )
+    scores = scores - scores.mean(axis=1, keepdims=True)
     # in units of what the robot is thought to do: the directions count that matter beside it
     P = np.tile(1 / np.repeat([stated.robot_t, stated.robot_r], 3) ** 2, n)
     factor = 1.0
@@ -182,7 +255,10 @@ def _weigh(
         factor = max(1.0, spread[0] / max(spread[1], 1e-300))
     temperature = max(factor * variance, 1e-30)
     held = temperature * np.diag(P)
-    S = without_slope_noise(
-        level.problem, level.grid, state, loss, lin, S, held, everywhere, workers
+    less, _ = without_slope_noise(
+        level.problem, level.grid, state, loss, lin, S, held, everywhere, workers, sigma
     )
-    return temperature, factor, S
+    # in a direction that nothing holds there is nothing to believe either
+    firm = S + np.diag(1e-9 * np.diag(S) + 1e-300)
+    believed = np.eye(len(S)) if less is S else np.linalg.solve(firm, less).T
+    return Worth(temperature, factor, less, believed)

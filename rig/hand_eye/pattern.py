@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from depthba.dataset import Sensor
 from depthba.optimiser import eliminate
 from depthba.optimiser.level import Level
-from depthba.optimiser.linearise import Linearisation, Loss, State, Workers, linearise
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
 from depthba.optimiser.problem import BLOCKS, Problem
+from depthba.optimiser.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class Waves:
 
 
 def waves_of(problem: Problem, sensor: Sensor) -> Waves:
-    """Return the waves at the points of a problem, weights as prepared; none without rays."""
+    """Return the waves at the points of a problem; none where the rays are not known."""
     camera = sensor.camera
     if camera is None or not sensor.origin:
         return Waves(tuple(np.zeros((len(f), 0), np.float32) for f in problem.frames))
@@ -71,15 +72,22 @@ def waves_of(problem: Problem, sensor: Sensor) -> Waves:
         v = (p[:, 1] / p[:, 2] * camera.fy + camera.cy + 0.5) / camera.height
         plain = np.stack([np.ones_like(u), u - 0.5, v - 0.5], axis=1)
         wave = (_cosines(u, v) - plain @ taken)[:, keep] / rms[keep]
-        found.append((wave / np.maximum(p[:, 3:4], 1e-6)).astype(np.float32))
+        if sensor.noise is not None and problem.noise:
+            wave *= sensor.noise.sigma(p[:, 2:3]) / problem.noise
+        found.append(wave.astype(np.float32))
     return Waves(tuple(found))
 
 
 def _cosines(u: Array, v: Array) -> Array:
-    """Return (n, 48) cosines with as many half waves as there are blocks, u and v from 0 to 1."""
-    across = np.cos(np.pi * u[:, None] * np.arange(BLOCKS[0]))
-    down = np.cos(np.pi * v[:, None] * np.arange(BLOCKS[1]))
-    return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(u), -1))
+    """Return (n, m) cosines, u and v from 0 to 1.
+
+    At most as many half waves as there are blocks, both ways taken together.
+    """
+    columns, rows = BLOCKS
+    across = np.cos(np.pi * u[:, None] * np.arange(columns))
+    down = np.cos(np.pi * v[:, None] * np.arange(rows))
+    k, j = np.nonzero(np.add.outer(np.arange(columns) / columns, np.arange(rows) / rows) < 1)
+    return np.asarray(across[:, k] * down[:, j])
 
 
 @dataclass(frozen=True)

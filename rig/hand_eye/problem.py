@@ -46,7 +46,7 @@ def flange_poses(dataset: Dataset) -> Array:
     return np.stack(poses)
 
 
-def set_up(dataset: Dataset, T_flange_camera: Array, reach: float) -> tuple[Problem, Chain]:
+def set_up(dataset: Dataset, T_flange_camera: Array, sigma: Array) -> tuple[Problem, Chain]:
     """Read the points, and hang the cameras on the flanges.
 
     The base stands in the world as the measured poses say; that fixes the gauge and nothing else.
@@ -54,13 +54,14 @@ def set_up(dataset: Dataset, T_flange_camera: Array, reach: float) -> tuple[Prob
     Args:
         dataset: with flange poses.
         T_flange_camera: (4, 4), the start.
-        reach: m, by which the start may displace a point.
+        sigma: (6,) m and rad, how far off it may be.
     """
     T_base_flange = flange_poses(dataset)
     behind = T_flange_camera if dataset.T_flange_camera is None else dataset.T_flange_camera
     T_world_base = dataset[0].T_world_camera @ se3.inverse(T_base_flange[0] @ behind)
     T_world_camera = T_world_base @ T_base_flange @ T_flange_camera
-    problem = prepare(dataset, T_world_camera, near_box(dataset, T_world_camera, reach))
+    problem = prepare(dataset, T_world_camera, near_box(dataset, T_world_camera, sigma))
+    reach = 2 * displaced(sigma, problem.ranges)
     total = sum(len(f) for f in problem.frames)
     stride = max(1, total // ENOUGH)
     problem = replace(
@@ -82,7 +83,12 @@ def set_up(dataset: Dataset, T_flange_camera: Array, reach: float) -> tuple[Prob
     return problem, chain
 
 
-def near_box(dataset: Dataset, T_world_camera: Array, reach: float) -> Roi | None:
+def displaced(sigma: Array, ranges: float) -> float:
+    """Return by how much an error of X, (6,) m and rad, moves a point at a distance, m."""
+    return float(np.hypot(sigma[:3].max(), sigma[3:].max() * ranges))
+
+
+def near_box(dataset: Dataset, T_world_camera: Array, sigma: Array) -> Roi | None:
     """Return the box in the map frame that holds the points of usual noise; None without noise.
 
     A floor behind the table would stretch the map, and coarsen it, for points that say little.
@@ -90,7 +96,7 @@ def near_box(dataset: Dataset, T_world_camera: Array, reach: float) -> Roi | Non
     Args:
         dataset: the frames.
         T_world_camera: (N, 4, 4), the start.
-        reach: m, by which the start may displace a point.
+        sigma: (6,) m and rad, how far off it may be.
     """
     noise = dataset.sensor.noise
     clouds = [frame.points() for frame in dataset]
@@ -106,6 +112,7 @@ def near_box(dataset: Dataset, T_world_camera: Array, reach: float) -> Roi | Non
             for p, s, T in zip(some, sigmas, T_map_camera, strict=True)
         ]
     )
+    reach = 2 * displaced(sigma, float(np.median(np.concatenate([p[:, 2] for p in some]))))
     low, high = np.quantile(near, [0.001, 0.999], axis=0)
     low, high = low - reach, high + reach
     return (
@@ -117,7 +124,7 @@ def joint_motions(dataset: Dataset, T_base_flange: Array) -> Array:
     """Return (6N, n), how the flanges move with the joints, m and rad per rad.
 
     Empty where the frames have no joints, or those of an arm that is not known. An arm calibrated
-    by its maker differs from its drawings by millimetres, which changes these motions by a hundredth.
+    by its maker differs from its drawings by millimetres, and these motions by a hundredth.
     """
     joints = [frame.joints for frame in dataset]
     for arm in ARMS:

@@ -1,0 +1,126 @@
+"""What a calibration leaves behind, and how it reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import se3
+from depthba.dataset import Dataset
+from depthba.errors import OptionError
+from depthba.verbs.output import length
+from rig.hand_eye.from_depth import HandEye
+
+FILE = "hand_eye.json"
+
+
+def read_transform(path: Path) -> NDArray[np.float64]:
+    """Read T_flange_camera (4, 4) from JSON.
+
+    The file holds the 4x4 itself, or an object with it under that name, as hand_eye.json and
+    dataset.json do.
+
+    Raises:
+        OptionError: there is none, or it is not rigid.
+    """
+    try:
+        raw = json.loads(path.read_text())
+        if isinstance(raw, dict):
+            raw = raw["T_flange_camera"]
+        T = np.array(raw, dtype=float)
+    except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
+        raise OptionError(
+            f"--start {path}: no T_flange_camera in it, expected JSON with a 4x4 of that name"
+        ) from error
+    if not se3.is_rigid(T):
+        raise OptionError(f"--start {path}: T_flange_camera is not rigid, expected a 4x4 in metres")
+    return T
+
+
+def content(result: HandEye, dataset: Dataset) -> dict[str, Any]:
+    """Return what hand_eye.json holds: m and rad but for what is named otherwise."""
+    sigma = np.sqrt(np.diag(result.covariance))
+    moved = se3.difference(result.T_flange_camera, result.T_flange_camera_start)
+    return {
+        "format": "depthba-hand-eye",
+        "version": 1,
+        "dataset": str(dataset.path.resolve()),
+        "method": "from-depth",
+        "verdict": result.status,
+        "trusted": result.trusted,
+        "reason": result.reason,
+        "open": [
+            {"name": o.name, "direction": o.direction.tolist(), "share": o.share}
+            for o in result.open
+        ],
+        "T_flange_camera": result.T_flange_camera.tolist(),
+        "sigma_mm": (1e3 * sigma[:3]).tolist(),
+        "sigma_deg": np.degrees(sigma[3:]).tolist(),
+        "covariance": result.covariance.tolist(),
+        "T_flange_camera_start": result.T_flange_camera_start.tolist(),
+        "moved_mm": float(1e3 * np.linalg.norm(moved[:3])),
+        "moved_deg": float(np.degrees(np.linalg.norm(moved[3:]))),
+        "turned_deg": np.degrees(result.turned).tolist(),
+        "robot": {
+            "sigma_mm": 1e3 * result.beliefs.robot_t,
+            "sigma_deg": float(np.degrees(result.beliefs.robot_r)),
+            "joint_zeros_deg": np.degrees(result.zeros).tolist(),
+        },
+        "pattern_mm": 1e3 * result.beliefs.pattern,
+        "inflation": result.inflation,
+        "sigma_m": result.sigma,
+        "spacing_m": result.spacing,
+        "frames": [
+            {
+                "frame": frame.id,
+                "residual_mm": float(1e3 * residual),
+                "flange_mm": (1e3 * missed[:3]).tolist(),
+                "flange_deg": np.degrees(missed[3:]).tolist(),
+            }
+            for frame, residual, missed in zip(
+                dataset, result.residuals, result.missed, strict=True
+            )
+        ],
+        "iterations": result.iterations,
+        "seconds": result.seconds,
+    }
+
+
+def text(result: HandEye, dataset: Dataset, run: Path) -> list[str]:
+    """Return the lines for people, the verdict first."""
+    X = result.T_flange_camera
+    t, r = 1e3 * X[:3, 3], np.degrees(se3.log_so3(X[:3, :3]))
+    sigma = np.sqrt(np.diag(result.covariance))
+    moved = se3.difference(X, result.T_flange_camera_start)
+    worst = int(np.argmax(np.linalg.norm(result.missed[:, :3], axis=1)))
+    lines = [
+        f"{dataset.name}: {result.status.replace('_', ' ')}. {result.reason}",
+        f"  frames        {len(dataset)}, the flange turned by {_three(np.degrees(result.turned))} "
+        "degrees (rms between frames, about three axes)",
+        f"  translation   {_three(t, 3)} mm, sigma {_three(1e3 * sigma[:3], 3)}",
+        f"  rotation      {_three(r, 4)} degrees (rotation vector), "
+        f"sigma {_three(np.degrees(sigma[3:]), 4)}",
+        f"  from start    {1e3 * np.linalg.norm(moved[:3]):.3f} mm, "
+        f"{np.degrees(np.linalg.norm(moved[3:])):.4f} degrees",
+        f"  robot         repeats to {1e3 * result.beliefs.robot_t:.3f} mm, "
+        f"{np.degrees(result.beliefs.robot_r):.4f} degrees; frame {dataset[worst].id} is off most, "
+        f"{length(float(np.linalg.norm(result.missed[worst, :3])))}",
+    ]
+    if len(result.zeros):
+        shown = " ".join(f"{v:.3f}" for v in np.degrees(result.zeros))
+        lines.append(f"  joint zeros   {shown} degrees off")
+    lines += [
+        f"  depth         sigma {length(result.sigma)} of the residuals, fixed pattern "
+        f"{length(result.beliefs.pattern)} a wave",
+        f"  time          {result.iterations} iterations, {result.seconds:.1f} s",
+        f"  result        {run / FILE}",
+    ]
+    return lines
+
+
+def _three(values: NDArray[np.float64], digits: int = 1) -> str:
+    return " ".join(f"{v:.{digits}f}" for v in values)
