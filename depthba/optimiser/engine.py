@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ NEGLIGIBLE = 0.002
 SETTLED, PASSING = 0.03, 0.1
 # Tolerance of a reduced matrix that only has to be near the one it preconditions.
 NEAR = 1e-2
-# Share of noise in what the data say about any direction from which on steps are guarded against it.
+# Share of noise in what the data say of a direction, from which on steps are guarded against it.
 NOISY = 0.1
 # That share grows from a level to the next by less than this.
 FINER = 4.0
@@ -101,7 +102,9 @@ class Engine:
         ``before`` is a map to start from in place of the points' averages.
         """
         known: certainty.Correlation | None = None
-        for index, spacing in enumerate(levels):
+        levels = list(levels)
+        for index in count():
+            spacing = levels[index]
             last = index == len(levels) - 1 or self.clock.over
             level = make_level(self.problem, poses, spacing, self.preset, self.options, last)
             heights = level_heights(
@@ -120,7 +123,15 @@ class Engine:
                 sure = self._sure(level, state, lin, near.S, temperature)
                 final = last and phase == phases(1, self.preset)[-1]
                 outcome = self._solve(
-                    level, state, phase, index, len(levels), temperature, believed, near.S, sure,
+                    level,
+                    state,
+                    phase,
+                    index,
+                    len(levels),
+                    temperature,
+                    believed,
+                    near.S,
+                    sure,
                     final,
                 )
                 state, lin = outcome.state, outcome.lin
@@ -128,6 +139,8 @@ class Engine:
             if last:
                 break
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
+            if known and self.options.resolution is None:
+                levels = self._no_finer(levels, index, np.sqrt(known.inflation) * outcome.sigma)
         found = self._conclude(level, outcome)
         for _ in range(AGAIN):
             if not outcome.converged or found.inflation > 0.5 * believed:
@@ -144,8 +157,15 @@ class Engine:
             found = self._conclude(level, outcome)
         return End(level, outcome, temperature, found)
 
+    def _no_finer(self, levels: list[float], index: int, deviation: float) -> list[float]:
+        """Return the levels less those that noise forbids, correlated as it has turned out."""
+        finest = schedule.finest_spacing(self.problem, deviation)
+        if levels[index + 1] >= finest:
+            return levels
+        return [*levels[: index + 1], min(finest, levels[index])]
+
     def _solve(
-        self, level: Level, state: State, phase: str, index: int, count: int, temperature: float,
+        self, level: Level, state: State, phase: str, index: int, levels: int, temperature: float,
         believed: float, near: NDArray[np.float64], sure: NDArray[np.float64] | None, final: bool,
     ) -> Outcome:  # fmt: skip
         rules = Rules(
@@ -159,7 +179,7 @@ class Engine:
         def report(p: Progress) -> None:
             self.history.append(
                 iteration(
-                    p, level, index, count, phase, len(self.history), self.problem,
+                    p, level, index, levels, phase, len(self.history), self.problem,
                     self.clock.elapsed,
                 )
             )  # fmt: skip

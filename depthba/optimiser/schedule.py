@@ -76,20 +76,21 @@ def check(options: Options) -> None:
             raise OptionError(f"--{name.replace('_', '-')} {value}: expected 1 or more")
 
 
-def finest_spacing(problem: Problem) -> float:
+def finest_spacing(problem: Problem, deviation: float | None = None) -> float:
     """Return the map spacing that the data call for, m.
 
     Near the spacing of the points, but no finer than noise allows: n points of deviation sigma on a
     cell of size s leave a slope of sigma / (s sqrt(n)) in the map, and n grows with s^2 times the
-    points' density.
+    points' density. ``deviation`` is what an independent point of as little knowledge would have,
+    m, as far as the residuals have shown it; None: the stated noise.
     """
-    if problem.noise is None:
+    deviation = problem.noise if deviation is None else deviation
+    if deviation is None:
         return 4 * problem.spacing
     area = float(np.prod(problem.upper - problem.lower))
     density = sum(len(f) for f in problem.frames) / max(area, 1e-12)
-    return max(
-        FINEST * problem.spacing, float(np.sqrt(problem.noise / NOISE_SLOPE / np.sqrt(density)))
-    )
+    by_noise = float(np.sqrt(deviation / NOISE_SLOPE / np.sqrt(density)))
+    return max(FINEST * problem.spacing, by_noise)
 
 
 def spacings(
