@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         OptionError,
         RunError,
     )
+    from depthba.optimiser.live import Registration, Update
     from depthba.optimiser.register import register
     from depthba.options import Options
     from depthba.result import Iteration, Result
@@ -38,8 +39,10 @@ __all__ = [
     "MissingPackage",
     "OptionError",
     "Options",
+    "Registration",
     "Result",
     "RunError",
+    "Update",
     "__version__",
     "register",
 ]
@@ -56,8 +59,10 @@ _HOMES = {
     "MissingPackage": "depthba.errors",
     "OptionError": "depthba.errors",
     "Options": "depthba.options",
+    "Registration": "depthba.optimiser.live",
     "Result": "depthba.result",
     "RunError": "depthba.errors",
+    "Update": "depthba.optimiser.live",
     "register": "depthba.optimiser.register",
 }
 

@@ -58,7 +58,7 @@ def conclude(
     engine.clock.lap("compare with the start")
     sigma = certainty.noise_sigma(level.problem, level.grid, state, outcome.loss, lin)
     known = end.known
-    if not better:
+    if known is None or not better:
         known = certainty.correlation(
             level.problem, level.grid, state, outcome.loss, lin, prior, engine.free, workers
         )

@@ -202,8 +202,15 @@ def direct_is_shorter(lin: Linearisation) -> bool:
     return bool(nodes < DIRECT * sum(map(len, lin.weights)))
 
 
-def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Reduction:
+def reduce(
+    lin: Linearisation,
+    workers: Workers,
+    tolerance: float = 1e-3,
+    free: NDArray[np.bool_] | None = None,
+) -> Reduction:
     """Eliminate the map exactly: one solve with C for each of the 6N columns of B.
+
+    Frames that are not ``free`` (N,) are left out: their rows say nothing.
 
     With X the solutions and R what they leave of B, ``B C^-1 B^T`` is ``X B^T + R X^T`` but for
     ``R C^-1 R^T``: an error of second order, so a tolerance of 1e-3 leaves 1e-6.
@@ -217,7 +224,7 @@ def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Red
         foot, (ys, xs) = lin.B[i], spans[i]
         shape = ys.stop - ys.start, xs.stop - xs.start
         X, R = np.zeros((*shape, 6), stored), np.zeros((*shape, 6), stored)
-        if foot.values.any():
+        if (free is None or free[i]) and foot.values.any():
             C = lin.C.window(ys, xs)
             inner = foot.y - ys.start, foot.x - xs.start
             h, w = foot.values.shape[:2]
@@ -230,7 +237,8 @@ def reduce(lin: Linearisation, workers: Workers, tolerance: float = 1e-3) -> Red
         return Footprint(ys.start, xs.start, X), Footprint(ys.start, xs.start, R)
 
     solved = workers.map(columns, range(n))
-    pairs = [(i, j) for i in range(n) for j in range(i, n) if meet(solved[i][0], solved[j][0])]
+    taken = [i for i in range(n) if free is None or free[i]]
+    pairs = [(i, j) for i in taken for j in taken if i <= j and meet(solved[i][0], solved[j][0])]
 
     def block(pair: tuple[int, int]) -> NDArray[np.float64]:
         i, j = pair

@@ -60,8 +60,8 @@ class End:
     outcome: Outcome
     temperature: float
     """m^2, what a squared normalised error of a measured pose cost."""
-    known: certainty.Correlation
-    """At the outcome."""
+    known: certainty.Correlation | None
+    """At the outcome; None where nobody asked for it."""
 
 
 @dataclass
@@ -95,12 +95,19 @@ class Engine:
         return replace(self.prior, information=0 * self.prior.information)
 
     def run(
-        self, levels: list[float], poses: NDArray[np.float64], before: Map | None = None
+        self,
+        levels: list[float],
+        poses: NDArray[np.float64],
+        refining: bool = False,
+        judged: bool = True,
     ) -> End:
         """Run levels of the given spacings, m, from poses (N, 4, 4) ``T_map_camera``.
 
-        ``before`` is a map to start from in place of the points' averages.
+        ``refining``: the poses are near the solution, so that no level needs the wide loss first.
+        ``judged``: what is known at the end is found out, and the last level goes on where it asks
+        for that.
         """
+        before: Map | None = None
         known: certainty.Correlation | None = None
         levels = list(levels)
         for index in count():
@@ -114,8 +121,8 @@ class Engine:
                 level.problem, level.grid, State(poses, heights), level.loss, level.smooth,
                 self.workers, 1, NEAR,
             )  # fmt: skip
-            for phase in phases(index if before is None else 1, self.preset):
-                near = eliminate.reduce(lin, self.workers, NEAR)
+            for phase in phases(1 if refining else index, self.preset):
+                near = eliminate.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
@@ -141,6 +148,8 @@ class Engine:
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
             if known and self.options.resolution is None:
                 levels = self._no_finer(levels, index, np.sqrt(known.inflation) * outcome.sigma)
+        if not judged:
+            return End(level, outcome, temperature, known)
         found = self._conclude(level, outcome)
         for _ in range(AGAIN):
             if not outcome.converged or found.inflation > 0.5 * believed:
@@ -214,7 +223,7 @@ class Engine:
         )  # fmt: skip
 
     def _conclude(self, level: Level, outcome: Outcome) -> certainty.Correlation:
-        at = eliminate.reduce(outcome.lin, self.workers)
+        at = eliminate.reduce(outcome.lin, self.workers, free=self.free)
         found = self._correlation(level, outcome.state, outcome.lin, at)
         self.clock.lap("certainty")
         return found

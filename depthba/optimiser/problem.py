@@ -94,11 +94,11 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
     clouds = [frame.points() for frame in dataset]
     if not any(len(p) for p in clouds):
         raise DatasetError(f"{dataset.path}: no frame has a single valid depth")
-    T_map_world = choose_map_frame(dataset, clouds, T_world_camera)
+    T_map_world = choose_map_frame(dataset.map_frame, clouds, T_world_camera)
     T_map_camera = T_map_world @ T_world_camera
     if roi is not None:
-        _check_roi(roi)
-        clouds = [_crop(p, T, roi) for p, T in zip(clouds, T_map_camera, strict=True)]
+        check_roi(roi)
+        clouds = [crop(p, T, roi) for p, T in zip(clouds, T_map_camera, strict=True)]
         if not any(len(p) for p in clouds):
             raise OptionError(f"--roi {' '.join(f'{v:g}' for v in roi)}: no point lies inside it")
     if sum(len(p) > 0 for p in clouds) < 2:
@@ -107,12 +107,9 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
             f"{dataset.path}: only frame {seen[0]} has valid depth, but registration "
             "needs 2 or more"
         )
-    sigmas = [_sigma(dataset.sensor.noise, p) for p in clouds]
-    typical = float(np.median(np.concatenate([s[:: max(1, len(s) // 2000)] for s in sigmas])))
-    frames = tuple(
-        _frame(p, typical / s, dataset.sensor) for p, s in zip(clouds, sigmas, strict=True)
-    )
-    lower, upper = _bounds(clouds, T_map_camera)
+    typical = typical_noise(dataset.sensor, clouds)
+    frames = tuple(frame_points(p, dataset.sensor, typical) for p in clouds)
+    lower, upper = bounds(clouds, T_map_camera)
     return Problem(
         frames=frames,
         T_map_camera=T_map_camera,
@@ -126,7 +123,7 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
 
 
 def choose_map_frame(
-    dataset: Dataset, clouds: list[NDArray[np.float32]], T_world_camera: NDArray[np.float64]
+    map_frame: str, clouds: list[NDArray[np.float32]], T_world_camera: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return T_map_world: the world itself where the dataset says so.
 
@@ -136,7 +133,7 @@ def choose_map_frame(
     direction, the normal of the plane fitted to all points, on the side of the sensors. The x axis
     stays as close to the world's as it can.
     """
-    if dataset.map_frame == "world":
+    if map_frame == "world":
         return np.eye(4)
     z = -T_world_camera[:, :3, 2].mean(axis=0)
     if np.linalg.norm(z) < 0.5:
@@ -172,7 +169,8 @@ def point_spacing(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
     return float(np.median(found))
 
 
-def _check_roi(roi: Roi) -> None:
+def check_roi(roi: Roi) -> None:
+    """Refuse a region of interest whose lower bounds are not below its upper ones."""
     for axis, low, high in zip("xyz", roi[0::2], roi[1::2], strict=True):
         if not low < high:
             raise OptionError(
@@ -181,7 +179,8 @@ def _check_roi(roi: Roi) -> None:
             )
 
 
-def _crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDArray[np.float32]:
+def crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDArray[np.float32]:
+    """Return the points that lie inside the region of interest under a pose ``T_map_camera``."""
     q = points @ T[:3, :3].T + T[:3, 3]
     inside = ((q >= np.array(roi[0::2])) & (q <= np.array(roi[1::2]))).all(axis=1)
     return np.ascontiguousarray(points[inside])
@@ -196,7 +195,15 @@ def _sigma(noise: RangeNoise | None, points: NDArray[np.float32]) -> NDArray[np.
     return np.asarray(sigma)
 
 
-def _frame(points: NDArray[np.float32], weight: NDArray[np.float64], sensor: Sensor) -> FramePoints:
+def typical_noise(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
+    """Return the median standard deviation of the points' range, m; 1 where none is stated."""
+    sigmas = [_sigma(sensor.noise, p[:: max(1, len(p) // 2000)]) for p in clouds]
+    return float(np.median(np.concatenate(sigmas)))
+
+
+def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) -> FramePoints:
+    """Wrap a cloud (n, 3) in the sensor frame; ``typical`` noise, m, gets the weight 1."""
+    weight = typical / _sigma(sensor.noise, points)
     n = len(points)
     if n == 0:
         return FramePoints(
@@ -239,7 +246,7 @@ def _extremes(points: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.asarray(some[np.unique(np.argmax(some @ directions.T, axis=0))])
 
 
-def _bounds(
+def bounds(
     clouds: list[NDArray[np.float32]], T_map_camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Bounds of the points in x and y, less a handful of strays that would blow up the map."""

@@ -145,7 +145,7 @@ def solve_level(
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
         direct = sure is None and eliminate.direct_is_shorter(lin)
-        here = eliminate.reduce(lin, workers) if direct else None
+        here = eliminate.reduce(lin, workers, free=free) if direct else None
         step = eliminate.solve(
             lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here, sure
         )
