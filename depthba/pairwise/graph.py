@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from depthba import se3
@@ -36,6 +37,7 @@ class Edge:
     lever: float
     """Distance from there at which a rotation is felt, m."""
     weight: float = 1.0
+    """How much it counts against others."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,42 @@ def solve(
         if mu > 1e4:
             break
         mu *= SHARPEN
-    believed = (squared < limit).astype(float)
+    T = _attached(T, edges, (squared < limit), tolerance)
+    believed = (_disagreement(T, edges) < tolerance).astype(float)
     T = _descend(T, T_map_camera, edges, believed, information, 10)
     return Solution(T, believed, _disagreement(T, edges))
+
+
+def _attached(
+    T: Floats, edges: list[Edge], believed: NDArray[np.bool_], tolerance: float
+) -> Floats:
+    """Tie groups of frames to the first one's, where wrong edges drowned the right ones.
+
+    Each edge between the two says where the group would lie; the place that edges of the most
+    weight agree on is taken.
+    """
+    T = T.copy()
+    i, j = (np.array([getattr(e, name) for e in edges]) for name in ("i", "j"))
+    weight = np.array([e.weight for e in edges])
+    while True:
+        ties = sparse.coo_matrix((believed, (i, j)), (len(T), len(T)))
+        group = connected_components(ties, directed=False)[1]
+        best, moved, member = 0.0, T, group == group[0]
+        for k in np.flatnonzero((group[i] == group[0]) != (group[j] == group[0])):
+            inside, outside = (i[k], j[k]) if group[i[k]] == group[0] else (j[k], i[k])
+            Z = edges[k].T_i_j if inside == i[k] else se3.inverse(edges[k].T_i_j)
+            these = group == group[outside]
+            candidate = T.copy()
+            candidate[these] = T[inside] @ Z @ se3.inverse(T[outside]) @ T[these]
+            bridges = (these[i] & member[j]) | (member[i] & these[j])
+            support = float(weight[bridges & (_disagreement(candidate, edges) < tolerance)].sum())
+            if support > best:
+                best, moved = support, candidate
+        if not best:
+            return T
+        T = moved
+        # what ties the new group must hold, or the loop would not end
+        believed = believed | (_disagreement(T, edges) < tolerance)
 
 
 def _errors(T: Floats, edges: list[Edge]) -> tuple[Floats, Floats]:

@@ -143,12 +143,14 @@ class _Frames:
         lattice = self.lattice
         views = self.views(self.T_start)
         found = self.searched(views)
+        T = self.T_start
         edges = [
-            self.edge(c.i, c.j, se3.inverse(self.T_start[c.i]) @ c.T_map_map @ self.T_start[c.j])
-            for c in found if c.evidence > PLAUSIBLE
-        ]  # fmt: skip
+            self.edge(c.i, c.j, se3.inverse(T[c.i]) @ c.T_map_map @ T[c.j], c.evidence)
+            for c in found
+            if c.evidence > PLAUSIBLE
+        ]
         information = self.start_information()
-        T = graph.solve(self.T_start, edges, COARSE * lattice.cell, information).T_map_camera
+        T = graph.solve(T, edges, COARSE * lattice.cell, information).T_map_camera
         thinned = self.each(lambda p: refine.prepare(p, VOXEL * lattice.cell), self.clouds)
         pairs: tuple[Pair, ...] = ()
         for reach in REACHES:
@@ -223,7 +225,7 @@ class _Frames:
 
         found = self.each(one, compared)
         sound = [k for k, (_, _, r, evidence) in enumerate(found) if r > ALIKE and evidence > SURE]
-        edges = [self.edge(*compared[k], found[k][0]) for k in sound]
+        edges = [self.edge(*compared[k], found[k][0], found[k][3]) for k in sound]
         solution = graph.solve(T, edges, FINE * lattice.cell, information)
         faults = [
             f"reliefs do not match: correlation {r:.2f}"
@@ -239,13 +241,13 @@ class _Frames:
         )
         return pairs, solution.T_map_camera
 
-    def edge(self, i: int, j: int, T_i_j: Floats) -> graph.Edge:
-        """Return an edge felt over the footprint of frame j."""
+    def edge(self, i: int, j: int, T_i_j: Floats, evidence: float) -> graph.Edge:
+        """Return an edge felt over the footprint of frame j; more evidence counts for more."""
         cloud = self.clouds[j]
         some = cloud[:: max(1, len(cloud) // 2000)].astype(float)
         at = some.mean(axis=0)
         lever = float(np.sqrt(np.square(some - at).sum(axis=1).mean()))
-        return graph.Edge(i, j, T_i_j, at, lever)
+        return graph.Edge(i, j, T_i_j, at, lever, min(evidence / PLAUSIBLE, 10.0))
 
     def start_information(self) -> Floats:
         """Return (N, 6, 6), the inverse covariance of the start."""

@@ -39,6 +39,27 @@ def test_graph_finds_the_truth_among_outliers(seed: int) -> None:
     assert (found.T_map_camera[0] == truth[0]).all()
 
 
+def test_graph_ties_a_frame_whose_right_edges_are_outnumbered() -> None:
+    """Wrong edges that agree with nothing do not keep the right ones out."""
+    rng = np.random.default_rng(0)
+    truth = ring(rng, 6)
+    edges = []
+    for i in range(6):
+        for j in range(i):
+            T_i_j, right = se3.inverse(truth[i]) @ truth[j], 3 not in (i, j) or {i, j} == {3, 0}
+            if not right:
+                T_i_j = se3.retract(T_i_j, rng.normal(size=6) * 0.3)
+            weight = 8.0 if {i, j} == {3, 0} else 1.5
+            edges.append(graph.Edge(i, j, T_i_j, np.array([0, 0, 1.0]), 0.5, weight))
+    start = truth.copy()
+    start[3] = se3.retract(truth[3], [0.3, -0.2, 0.1, 0.1, 0.1, -0.1])
+    information = np.repeat(np.diag([100.0] * 3 + [400.0] * 3)[None], 6, axis=0)
+    found = graph.solve(start, edges, 0.01, information)
+    assert found.believed.sum() == 11
+    # the start pulls a little at the one edge
+    assert np.abs(se3.difference(found.T_map_camera, truth)).max() < 0.002
+
+
 def test_graph_keeps_what_no_edge_holds() -> None:
     truth = ring(np.random.default_rng(0), 4)
     edge = graph.Edge(0, 1, se3.inverse(truth[0]) @ truth[1], np.zeros(3), 0.5)
