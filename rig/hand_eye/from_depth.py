@@ -21,6 +21,7 @@ from depthba.optimiser.level import level_heights, make_level
 from depthba.optimiser.workers import Workers
 from depthba.options import Options as MapOptions
 from rig.hand_eye.believed import Beliefs
+from rig.hand_eye.bends import without_bends
 from rig.hand_eye.descent import Iteration, Start, descend
 from rig.hand_eye.joint import Joint, solve
 from rig.hand_eye.pattern import waves_of
@@ -33,7 +34,7 @@ Array = NDArray[np.float64]
 WIDE = 12.0
 LIMIT = 40
 # Of a joint's zero, rad, and of each wave of the fixed pattern, m, to begin with.
-ZERO, PATTERN = 0.0002, 0.0001
+ZERO, PATTERN = 0.0005, 0.0001
 
 
 @dataclass(frozen=True)
@@ -197,6 +198,7 @@ def _estimate(
             descent = descend(level, chain, heights, start, robust, LIMIT, workers, report)
             chain, heights = descent.chain, descent.heights
         previous = level.grid
+    level = without_bends(level, descent.heights, chain.T_map_camera)
     waves = waves_of(level.problem, dataset.sensor)
     noise = options.robot_noise
     stated = Beliefs(sigma, ZERO, noise[0], float(np.radians(noise[1])), PATTERN)

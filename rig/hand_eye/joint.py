@@ -108,7 +108,8 @@ def solve(
         def total(lin: Linearisation, now: Array, worth: Worth, variance: Array) -> float:
             return lin.cost + worth.temperature * float((now**2 / variance).sum())
 
-        mixer, length, converged = Mixer(np.linalg.inv(covariance)), 1.0, False
+        metric = np.asarray(np.linalg.inv(covariance), float)
+        mixer, length, converged = Mixer(metric), 1.0, False
         for _ in range(STEPS):
             answer, gradient = _gradient(lin, J, worth, reply, waves)
             now = _unknowns(chain, start, pattern)
@@ -260,5 +261,7 @@ def _weigh(
     )
     # in a direction that nothing holds there is nothing to believe either
     firm = S + np.diag(1e-9 * np.diag(S) + 1e-300)
-    believed = np.eye(len(S)) if less is S else np.linalg.solve(firm, less).T
+    believed: Array = np.eye(len(S))
+    if less is not S:
+        believed = np.asarray(np.linalg.solve(firm, less).T, np.float64)
     return Worth(temperature, factor, less, believed)

@@ -105,7 +105,7 @@ def near_box(dataset: Dataset, T_world_camera: Array, sigma: Array) -> Roi | Non
     some = [p[:: max(1, len(p) // 20000)].astype(float) for p in clouds]
     sigmas = [noise.sigma(p[:, 2]) for p in some]
     limit = NOISY * float(np.median(np.concatenate(sigmas)))
-    T_map_camera = choose_map_frame(dataset, clouds, T_world_camera) @ T_world_camera
+    T_map_camera = choose_map_frame(dataset.map_frame, clouds, T_world_camera) @ T_world_camera
     near = np.concatenate(
         [
             p[s <= limit] @ T[:3, :3].T + T[:3, 3]
