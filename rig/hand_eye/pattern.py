@@ -23,7 +23,7 @@ from depthba.optimiser.workers import Workers
 Array = NDArray[np.float64]
 
 # How far points are moved to see what that does, m.
-DELTA = 5e-4
+DELTA = 2e-4
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ def answers(
 ) -> Answers:
     """Move all points along their rays wave by wave, with the robust weights held.
 
-    A point that is moved along its ray keeps the foot on the map where its residual is taken, so
-    that the answers are linear in the pattern.
+    A point that is moved along its ray keeps the foot on the map where its residual is taken, but
+    for the walk there being cut short: both ways differ, and their mean is taken.
     """
     frozen = replace(loss, robust_c=0.0)
     weighted = tuple(
@@ -132,28 +132,30 @@ def answers(
         moved = waves.without(problem, pattern)
         return linearise(moved, level.grid, state, frozen, workers, level.smooth)
 
-    base = at(waves, np.zeros(waves.count))
-    even = Waves(tuple(np.ones((len(f), 1), np.float32) for f in problem.frames))
-    once = at(even, np.array([DELTA]))
+    def both(waves: Waves, k: int) -> tuple[Linearisation, Linearisation]:
+        one = DELTA * np.eye(waves.count)[k]
+        return at(waves, -one), at(waves, one)
+
+    before, after = both(Waves(tuple(np.ones((len(f), 1), np.float32) for f in problem.frames)), 0)
     m = waves.count
     own = np.zeros((m, m))
     pulls = []
     for wave, a, b, weight, frame in zip(
-        waves.at, base.residuals, once.residuals, lin.weights, level.problem.frames, strict=True
+        waves.at, before.residuals, after.residuals, lin.weights, level.problem.frames, strict=True
     ):
         # the residual falls as the point is moved back by what is taken for the pattern
-        change = np.nan_to_num((b - a) / np.float32(DELTA))
+        change = np.nan_to_num((b - a) / np.float32(2 * DELTA))
         pulls.append((frame.points[:, 4] * change).astype(np.float32))
         w = (weight * pulls[-1] * change).astype(np.float32)
         own += wave.T @ (w[:, None] * wave)
     pose = np.zeros((lin.g_pose.size, m))
     fields, back = (np.zeros((m, *lin.g_map.shape), np.float32) for _ in range(2))
     for k in range(m):
-        moved = at(waves, DELTA * np.eye(m)[k])
-        field = (moved.g_map - base.g_map) / DELTA
+        before, after = both(waves, k)
+        field = (after.g_map - before.g_map) / (2 * DELTA)
         answer, _ = lin.C.solve(field, 1e-4)
         fields[k], back[k] = field, answer
-        coupled = (moved.g_pose - base.g_pose) / DELTA - eliminate.gather(lin, answer)
+        coupled = (after.g_pose - before.g_pose) / (2 * DELTA) - eliminate.gather(lin, answer)
         pose[:, k] = coupled.ravel()
     own -= np.tensordot(fields, back, ((1, 2), (1, 2)))
     return Answers(back, tuple(pulls), (own + own.T) / 2, pose)
