@@ -98,3 +98,26 @@ class Chain:
     def _about(self, pivots: Array, centre: Array) -> Array:
         """Take perturbations about the camera centres (N, 6, 6) to ones about the pivots."""
         return np.asarray(np.linalg.solve(about_pivot(self.T_map_camera, pivots), centre))
+
+
+def without_gauge(columns: Array, pivots: Array) -> Array:
+    """Return perturbations of all cameras less what moves everything alike.
+
+    A motion of all cameras together moves the map and nothing else, so depths say nothing about
+    it. On a grid that stands still they seem to say a little, which would pass for knowledge where
+    the motions leave X open.
+
+    Args:
+        columns: (6N, k), perturbations about the pivots.
+        pivots: (N, 3), map frame, m.
+    """
+    arm = pivots - pivots.mean(axis=0)
+    lever = max(float(np.sqrt(np.square(arm).sum(axis=1).mean())), 1e-3)
+    alike = np.zeros((len(pivots), 6, 6))
+    alike[:, :3, :3] = np.eye(3)
+    alike[:, :3, 3:] = -se3.hat(arm) / lever
+    alike[:, 3:, 3:] = np.eye(3) / lever
+    scale = np.tile(np.repeat([1.0, lever], 3), len(pivots))[:, None]
+    basis = np.linalg.qr(scale * alike.reshape(-1, 6))[0]
+    scaled = scale * columns
+    return np.asarray((scaled - basis @ (basis.T @ scaled)) / scale)

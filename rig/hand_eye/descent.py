@@ -19,7 +19,7 @@ from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.solver import solve_map
 from depthba.optimiser.workers import Workers
-from rig.hand_eye.chain import Chain
+from rig.hand_eye.chain import Chain, without_gauge
 
 Array = NDArray[np.float64]
 
@@ -114,9 +114,10 @@ def descend(
         answer, _ = lin.C.solve(-lin.g_map, 1e-3)
         J = chain.by_hand_eye(lin.pivots)
         held = temperature / start.sigma**2
-        gradient = J.T @ (lin.g_pose + eliminate.gather(lin, answer)).ravel()
+        seen = without_gauge(J, lin.pivots)
+        gradient = seen.T @ (lin.g_pose + eliminate.gather(lin, answer)).ravel()
         gradient += held * start.error(chain)
-        through, M = responses(lin, J, workers)
+        through, M = responses(lin, J, seen, workers)
         M += np.diag(held)
         x = -np.linalg.solve(M + damping * np.diag(np.diag(M)), gradient)
         map_step = answer - np.tensordot(x, through, 1)
@@ -142,8 +143,15 @@ def descend(
     return Descent(chain, heights, loss, lin)
 
 
-def responses(lin: Linearisation, J: Array, workers: Workers) -> tuple[Array, Array]:
-    """Return the map's answer ``C^-1 B^T J`` (k, ny, nx) and ``J^T S J`` for J (6N, k)."""
+def responses(lin: Linearisation, J: Array, seen: Array, workers: Workers) -> tuple[Array, Array]:
+    """Return the map's answer ``C^-1 B^T J`` (k, ny, nx) and the information.
+
+    Args:
+        lin: the normal equations.
+        J: (6N, k), perturbations of the cameras.
+        seen: (6N, k), the same less what moves all cameras alike.
+        workers: the threads.
+    """
     n = len(lin.B)
 
     def one(column: Array) -> tuple[Array, Array]:
@@ -153,7 +161,7 @@ def responses(lin: Linearisation, J: Array, workers: Workers) -> tuple[Array, Ar
         return field, product.ravel()
 
     fields, products = zip(*workers.map(one, list(J.T)), strict=True)
-    M = J.T @ np.stack(products, axis=1)
+    M = seen.T @ np.stack(products, axis=1)
     return np.stack(fields), np.asarray((M + M.T) / 2)
 
 

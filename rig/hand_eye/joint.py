@@ -19,7 +19,7 @@ from depthba.optimiser.problem import BLOCKS
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.workers import Workers
 from rig.hand_eye.believed import Beliefs, estimate, newton_step
-from rig.hand_eye.chain import Chain
+from rig.hand_eye.chain import Chain, without_gauge
 from rig.hand_eye.descent import Descent, Iteration, Start
 from rig.hand_eye.pattern import Answers, Waves, answers
 
@@ -99,8 +99,9 @@ def solve(
         if reply is None:  # hardly changes afterwards, and takes a pass for each wave
             reply = answers(here, state, loss, lin, waves, workers)
         J = chain.jacobian(lin.pivots)
-        newton, H = _information(J, worth, reply)
-        _, gradient = _gradient(lin, J, worth, reply, waves)
+        seen = without_gauge(J, lin.pivots)
+        newton, H = _information(seen, worth, reply)
+        _, gradient = _gradient(lin, seen, worth, reply, waves)
         now = _unknowns(chain, start, pattern)
         beliefs, _, covariance = estimate(H, gradient, now, stated, zeros, n, m)
         variance = beliefs.variances(zeros, n, m)
@@ -111,7 +112,7 @@ def solve(
         metric = np.asarray(np.linalg.inv(covariance), float)
         mixer, length, converged = Mixer(metric), 1.0, False
         for _ in range(STEPS):
-            answer, gradient = _gradient(lin, J, worth, reply, waves)
+            answer, gradient = _gradient(lin, seen, worth, reply, waves)
             now = _unknowns(chain, start, pattern)
             full = newton_step(newton, gradient, now, variance)
             converged = float(full[:6] @ np.linalg.solve(covariance[:6, :6], full[:6])) < (

@@ -35,7 +35,7 @@ def flanges(count: int, axes: str) -> Floats:
     return se3.make(R, t)
 
 
-def write_arm(path: Path, axes: str = "xyz", frames: int = 8, flange: bool = True) -> Dataset:
+def write_arm(path: Path, axes: str = "xyz", frames: int = 6, flange: bool = True) -> Dataset:
     """Write a dataset of the bumpy surface; the robot is exact to 0.03 mm and 0.005 degrees."""
     rng = np.random.default_rng(1)
     T_true = flanges(frames, axes)
@@ -57,6 +57,7 @@ def write_arm(path: Path, axes: str = "xyz", frames: int = 8, flange: bool = Tru
     for i in range(frames):
         depth = ray_cast(T_true[i] @ X, bumpy)
         depth = depth + NOISE * rng.standard_normal(depth.shape) * along_ray
+        depth[depth > 1.25] = np.nan
         writer.add_frame(
             stamp=float(i),
             depth=depth,

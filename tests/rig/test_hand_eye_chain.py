@@ -9,7 +9,7 @@ from depthba import se3
 from depthba.kinematics import UR16E
 from depthba.optimiser.prior import move
 from rig.hand_eye.believed import Beliefs, estimate, posterior
-from rig.hand_eye.chain import Chain
+from rig.hand_eye.chain import Chain, without_gauge
 from rig.hand_eye.verdict import motion_fault, open_directions, turned
 from tests.rig.arm_scene import X, flanges
 
@@ -48,6 +48,17 @@ def test_zeros_move_the_flange_as_the_arm_does() -> None:
     step = np.concatenate([np.zeros(6), off, np.zeros(6 * N)])
     difference = se3.difference(one.moved(step).T_base_flange_corrected, UR16E.forward(q + off))
     assert np.abs(difference).max() < 1e-8
+
+
+def test_what_moves_all_cameras_alike_is_taken_off_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    pivots, motion = rng.uniform(-1, 1, (N, 3)), rng.standard_normal(6)
+    alike = np.hstack([motion[:3] + np.cross(motion[3:], pivots), np.tile(motion[3:], (N, 1))])
+    other = rng.standard_normal((6 * N, 2))
+    assert np.abs(without_gauge(alike.reshape(-1, 1), pivots)).max() < 1e-12
+    once = without_gauge(other, pivots)
+    np.testing.assert_allclose(without_gauge(once + alike.reshape(-1, 1), pivots), once, atol=1e-12)
+    assert np.linalg.matrix_rank(np.hstack([other - once, alike.reshape(-1, 1)])) <= 3
 
 
 def test_posterior_weighs_data_and_beliefs() -> None:
