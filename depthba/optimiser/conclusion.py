@@ -56,20 +56,16 @@ def conclude(
     better = cost_end <= cost_start
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")
-    sigma = certainty.noise_sigma(level.problem, level.grid, state, outcome.loss, lin)
-    known = end.known
-    if known is None or not better:
-        known = certainty.correlation(
-            level.problem, level.grid, state, outcome.loss, lin, prior, engine.free, workers
-        )
+    firm, firm_lin, known = engine.known_at(level, state, outcome.loss)
+    sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
     variance = known.inflation * sigma**2
+    held_by_prior = block_diag(*prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0])
     S, _ = without_slope_noise(
-        level.problem, level.grid, state, outcome.loss, lin, known.S,
-        variance * block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0]),
+        firm, level.grid, state, outcome.loss, firm_lin, known.S, variance * held_by_prior,
         engine.free, workers, sigma,
     )  # fmt: skip
     judged = certainty.assess(
-        level.problem, state, lin, S, variance, prior, engine.preset.prior, engine.free, ids
+        level.problem, state, firm_lin, S, variance, prior, engine.preset.prior, engine.free, ids
     )
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)

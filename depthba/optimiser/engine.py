@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from depthba.optimiser import certainty, eliminate, schedule
+from depthba.optimiser.bends import without_bends
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level, level_heights, make_level
-from depthba.optimiser.linearise import Linearisation, State, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.prior import PosePrior
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
@@ -60,8 +61,6 @@ class End:
     outcome: Outcome
     temperature: float
     """m^2, what a squared normalised error of a measured pose cost."""
-    known: certainty.Correlation | None
-    """At the outcome; None where nobody asked for it."""
 
 
 @dataclass
@@ -149,22 +148,37 @@ class Engine:
             if known and self.options.resolution is None:
                 levels = self._no_finer(levels, index, np.sqrt(known.inflation) * outcome.sigma)
         if not judged:
-            return End(level, outcome, temperature, known)
-        found = self._conclude(level, outcome)
+            return End(level, outcome, temperature)
         for _ in range(AGAIN):
+            found = self.known_at(level, outcome.state, outcome.loss)[2]
             if not outcome.converged or found.inflation > 0.5 * believed:
                 break
             believed = found.inflation
             outcome = self._solve(
-                level, outcome.state, phase, index, len(levels), temperature, believed, found.S,
-                None if sure is None else self._sure(
-                    level, outcome.state, outcome.lin, found.S, temperature
-                ),
-                True,
+                level, outcome.state, phase, index, len(levels), temperature, believed, near.S,
+                sure, True,
             )  # fmt: skip
             self.clock.lap(f"level {index} {phase}")
-            found = self._conclude(level, outcome)
-        return End(level, outcome, temperature, found)
+        return End(level, outcome, temperature)
+
+    def known_at(
+        self, level: Level, state: State, loss: Loss
+    ) -> tuple[Problem, Linearisation, certainty.Correlation]:
+        """Return what the points say at a state, but for those that must not vouch for it.
+
+        That is the problem without the points at sharp bends, its linearisation, and how
+        correlated their residuals are.
+        """
+        problem = level.problem
+        if self.preset.robust:
+            problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
+        lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
+        at = eliminate.reduce(lin, self.workers, free=self.free)
+        found = certainty.correlation(
+            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at
+        )
+        self.clock.lap("certainty")
+        return problem, lin, found
 
     def _no_finer(self, levels: list[float], index: int, deviation: float) -> list[float]:
         """Return the levels less those that noise forbids, correlated as it has turned out."""
@@ -221,12 +235,6 @@ class Engine:
             level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,
             at,
         )  # fmt: skip
-
-    def _conclude(self, level: Level, outcome: Outcome) -> certainty.Correlation:
-        at = eliminate.reduce(outcome.lin, self.workers, free=self.free)
-        found = self._correlation(level, outcome.state, outcome.lin, at)
-        self.clock.lap("certainty")
-        return found
 
 
 def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from depthba.dataset import Dataset
 from depthba.errors import OptionError
 from depthba.optimiser import schedule
+from depthba.optimiser.bends import without_bends
 from depthba.optimiser.level import level_heights, make_level
 from depthba.optimiser.workers import Workers
 from depthba.options import Options as MapOptions
 from rig.hand_eye.believed import Beliefs
-from rig.hand_eye.bends import without_bends
 from rig.hand_eye.descent import Iteration, Start, descend
 from rig.hand_eye.joint import Joint, solve
 from rig.hand_eye.pattern import waves_of
@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 # The robust loss begins this wide, in robust standard deviations.
 WIDE = 12.0
 LIMIT = 40
+# Change of slope of the map beyond which points take no part in the end: where more is kept the
+# depths contradict the truth, where less is kept they leave the robot's own errors undecided.
+SHARP = 2.0
 # Of a joint's zero, rad, and of each wave of the fixed pattern, m, to begin with.
 ZERO, PATTERN = 0.0005, 0.0001
 
@@ -198,7 +201,8 @@ def _estimate(
             descent = descend(level, chain, heights, start, robust, LIMIT, workers, report)
             chain, heights = descent.chain, descent.heights
         previous = level.grid
-    level = without_bends(level, descent.heights, chain.T_map_camera)
+    steady = without_bends(level.problem, level.grid, descent.heights, chain.T_map_camera, SHARP)
+    level = replace(level, problem=steady)
     waves = waves_of(level.problem, dataset.sensor)
     noise = options.robot_noise
     stated = Beliefs(sigma, ZERO, noise[0], float(np.radians(noise[1])), PATTERN)
