@@ -40,7 +40,7 @@ from depthba.optimiser.linearise import (
 )
 from depthba.optimiser.prior import about_pivot
 from depthba.optimiser.problem import FramePoints, Problem, Roi, prepare
-from depthba.optimiser.slope_noise import _noise_linearisation
+from depthba.optimiser.slope_noise import noise_linearisation
 from depthba.optimiser.solver import solve_map
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
@@ -189,7 +189,7 @@ def _of_clean(problem: Problem, spacing: float, workers: Workers) -> tuple[Float
 
 def _of_noisy(problem: Problem, spacing: float, workers: Workers) -> tuple[Floats, Linearisation]:
     problem, grid, state, loss, lin = _fitted(problem, spacing, workers)
-    noise = _noise_linearisation(problem, grid, state, loss, lin, workers)
+    noise = noise_linearisation(problem, grid, state, loss, lin, workers)
     S = eliminate.exact(lin, workers, TOLERANCE)
     S -= (problem.noise or 0.0) ** 2 * eliminate.exact(noise, workers, 1e-3)
     return S / _kept_of_noise(schedule.PRESETS["default"].robust), lin

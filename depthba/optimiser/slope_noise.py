@@ -67,7 +67,7 @@ def without_slope_noise(
         share: of noise in any direction, below which S itself is returned.
     """
     variance = (robust_sigma(lin.residuals) if sigma is None else sigma) ** 2
-    noisy = _noise_linearisation(problem, grid, state, loss, lin, workers)
+    noisy = noise_linearisation(problem, grid, state, loss, lin, workers)
     n = len(free)
     bound = np.zeros_like(S)
     for i in range(n):
@@ -112,7 +112,7 @@ def _less(
     return np.asarray((back * np.maximum(values, 0.0)) @ back.T)
 
 
-def _noise_linearisation(
+def noise_linearisation(
     problem: Problem,
     grid: Grid,
     state: State,
