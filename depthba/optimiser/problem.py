@@ -130,8 +130,9 @@ def choose_map_frame(
     Else a plane facing the sensors.
 
     The z axis is the mean viewing direction reversed; where the sensors look in no common
-    direction, the normal of the plane fitted to all points, on the side of the sensors. The x axis
-    stays as close to the world's as it can.
+    direction, the normal of the plane fitted to all points, on the side of the sensors. The origin
+    is the first frame's sensor, the x axis as close to that sensor's as it can be: another world
+    frame changes nothing.
     """
     if map_frame == "world":
         return np.eye(4)
@@ -148,10 +149,12 @@ def choose_map_frame(
         if z @ (T_world_camera[:, :3, 3].mean(axis=0) - world.mean(axis=0)) < 0:
             z = -z
     z = z / np.linalg.norm(z)
-    x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = T_world_camera[0]
+    x = first[:3, 0] if abs(first[:3, 0] @ z) < 0.9 else first[:3, 1]
     x = x - z * (z @ x)
     x /= np.linalg.norm(x)
-    return se3.make(np.stack([x, np.cross(z, x), z]), np.zeros(3))
+    R = np.stack([x, np.cross(z, x), z])
+    return se3.make(R, -R @ first[:3, 3])
 
 
 def point_spacing(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
