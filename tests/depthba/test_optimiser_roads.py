@@ -1,0 +1,160 @@
+"""Both roads to a step, their parts, and that threads change nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from depthba.optimiser import eliminate
+from depthba.optimiser.bends import without_bends
+from depthba.optimiser.certainty import noise_sigma
+from depthba.optimiser.eliminate import Step
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
+from depthba.optimiser.mixing import Mixer
+from depthba.optimiser.solver import solve_map
+from depthba.optimiser.stencil import MapSolver, Stencil
+from depthba.optimiser.workers import Workers
+from tests.depthba.optimiser_problems import (
+    ROBUST,
+    Floats,
+    awkward_case,
+    looking_down,
+    problem_of,
+)
+
+
+@pytest.fixture(scope="module")
+def lin() -> Linearisation:
+    case = awkward_case(0)
+    return linearise(case.problem, case.grid, case.state, ROBUST, Workers(1), case.smooth)
+
+
+def mass_like(shape: tuple[int, int], seed: int = 0) -> Stencil:
+    """A positive definite stencil with the couplings of scattered points."""
+    rng = np.random.default_rng(seed)
+    C = Stencil(rng.uniform(2.0, 9.0, shape), *(rng.uniform(0.0, 0.2, shape) for _ in range(4)))
+    C.right[:, -1] = C.up[-1] = C.up_right[-1] = C.up_left[-1] = 0.0
+    C.up_right[:, -1] = C.up_left[:, -1] = 0.0
+    return C
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-10])
+def test_map_solver_is_the_same_on_any_number_of_threads(tolerance: float) -> None:
+    C = mass_like((301, 47))
+    b = np.random.default_rng(1).standard_normal((301, 47))
+    alone, _ = C.solve(b, tolerance)
+    for threads in (2, 3):
+        workers = Workers(threads)
+        assert len(workers.bands(301)) == threads
+        together, _ = MapSolver(C, tolerance, workers).solve(b, tolerance)
+        workers.close()
+        np.testing.assert_array_equal(together, alone)
+    left = (b - C.times(alone)) / np.sqrt(C.own)
+    assert np.linalg.norm(left) < 1.1 * tolerance * np.linalg.norm(b / np.sqrt(C.own))
+
+
+def test_window_is_solved_as_if_the_rest_stood_still() -> None:
+    C, rng = mass_like((40, 50)), np.random.default_rng(2)
+    b = rng.standard_normal((12, 17))
+    got = MapSolver(C, 1e-10).solve_window(b, 9, 21, 1e-10)
+    window = C.window(slice(9, 21), slice(21, 38))
+    # a sparse matrix has no room for couplings that point outside
+    want = np.linalg.solve(window.sparse().toarray(), b.ravel())
+    np.testing.assert_allclose(got.ravel(), want, atol=1e-8)
+
+
+def test_loose_tolerance_leaves_an_error_of_second_order(lin: Linearisation) -> None:
+    want = eliminate.exact_sparse(lin)
+    scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+    coarse, fine = (
+        np.abs((eliminate.reduce(lin, Workers(1), t).S - want) / scale).max() for t in (1e-2, 1e-4)
+    )
+    assert coarse < 1e-2 and fine < 1e-5
+
+
+def test_frames_that_stand_still_are_left_out(lin: Linearisation) -> None:
+    free = np.array([False, True, True, False])
+    whole, part = (eliminate.reduce(lin, Workers(1), 1e-8, f).S for f in (None, free))
+    keep = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
+    np.testing.assert_allclose(part[keep], whole[keep], rtol=1e-12)
+
+
+def test_both_roads_lead_to_the_same_step(lin: Linearisation) -> None:
+    """The iterative road, preconditioned by a matrix of another place, against the direct one."""
+    n, workers = len(lin.A), Workers(1)
+    free = np.arange(n) > 0
+    nothing = np.repeat(np.eye(6)[None], n, axis=0), np.zeros((n, 6))
+    here = eliminate.reduce(lin, workers, 1e-8)
+    elsewhere = eliminate.reduce(lin, workers, 1e-2).S + 0.1 * np.diag(np.diag(here.S))
+    direct = eliminate.solve(lin, free, nothing, 0.0, workers, 1e-9, 0, here=here)
+    iterative = eliminate.solve(lin, free, nothing, 0.0, workers, 1e-9, 200, near=elsewhere)
+    for one, other in ((direct.pose, iterative.pose), (direct.map, iterative.map)):
+        assert np.linalg.norm(one - other) < 1e-6 * np.linalg.norm(one)
+    assert iterative.decrement == pytest.approx(direct.decrement, rel=1e-5)
+
+
+def test_step_without_noise_in_it_is_the_plain_one(lin: Linearisation) -> None:
+    n, workers = len(lin.A), Workers(1)
+    free = np.arange(n) > 0
+    prior = np.repeat(np.eye(6)[None], n, axis=0), np.full((n, 6), 0.1)
+    here = eliminate.reduce(lin, workers, 1e-8)
+    plain = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, here=here)
+    sure = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=here.S)
+    np.testing.assert_allclose(sure.pose, plain.pose, atol=1e-5 * np.abs(plain.pose).max())
+    # where all is noise, the measured poses alone decide
+    held = eliminate.solve(
+        lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=np.zeros_like(here.S)
+    )
+    np.testing.assert_allclose(held.pose[1:], -0.1, rtol=1e-6)
+
+
+def test_mixing_ends_a_linear_process_early() -> None:
+    """Steps of a linear iteration with rates 0.2 to 0.8: plain, the error would shrink by 0.8."""
+    rng = np.random.default_rng(0)
+    rates, goal = np.linspace(0.2, 0.8, 12), rng.standard_normal(12)
+    x, mixer = np.zeros(12), Mixer()
+    for _ in range(12):
+        step = Step(((1 - rates) * (goal - x)).reshape(2, 6), np.zeros((1, 1)), 0.0)
+        mixed = mixer.mix(step, np.eye(12))
+        mixer.took(mixed)
+        x = x + mixed.pose.ravel()
+    assert np.linalg.norm(x - goal) < 0.1 * 0.8**12 * np.linalg.norm(goal)
+
+
+def flat_case(count: int) -> tuple[Floats, list[Floats]]:
+    """Frames over a plane with noise of 1 mm along z: poses, clouds (n, 5)."""
+    rng = np.random.default_rng(4)
+    T = looking_down(2, rng, tilt=0.0)
+    clouds = []
+    for pose in T:
+        xy = rng.uniform(-0.3, 0.3, (count, 2))
+        q = np.column_stack([xy, 0.001 * rng.standard_normal(count)])
+        clouds.append(np.column_stack([(q - pose[:3, 3]) @ pose[:3, :3], np.ones((count, 2))]))
+    return T, clouds
+
+
+@pytest.mark.parametrize("per_node", [2, 6, 30])
+def test_noise_is_told_although_the_map_follows_the_points(per_node: int) -> None:
+    spacing = 0.02
+    T, clouds = flat_case(int(per_node / 2 * (0.6 / spacing) ** 2))
+    problem, grid = problem_of(clouds, T), Grid(np.array([-0.44, -0.44]), spacing, (45, 45))
+    loss = Loss(False, True, 0.0, 2 * spacing, 0.0, 1e-3)
+    smooth = np.ones(grid.shape, bool)
+    state, lin = solve_map(
+        problem, grid, State(T, np.zeros(grid.shape)), loss, smooth, Workers(1), 2, 1e-8
+    )
+    assert noise_sigma(problem, grid, state, loss, lin) == pytest.approx(0.001, rel=0.1)
+
+
+def test_points_at_a_step_are_left_out_and_no_others() -> None:
+    T, clouds = flat_case(4000)
+    problem, grid = problem_of(clouds, T), Grid(np.array([-0.44, -0.44]), 0.02, (45, 45))
+    x = grid.origin[0] + grid.spacing * np.arange(45)
+    heights = np.tile(np.where(x > 0.05, 0.1, 0.3 * x), (45, 1))
+    kept = without_bends(problem, grid, heights, T)
+    for frame, pose in zip(kept.frames, T, strict=True):
+        at = frame.points[:, :3] @ pose[0, :3] + pose[0, 3]
+        share = frame.points[:, 4]
+        assert not share[np.abs(at - 0.05) < 0.02].any()
+        assert (share[np.abs(at - 0.05) > 0.06] == 1.0).all()
