@@ -61,6 +61,8 @@ class Correlation:
     """(6N, 6N), exact reduced matrix that it was measured with."""
     owed: float
     """Largest share that the measured poses have in any direction of the estimate, 0 to 1."""
+    scores: NDArray[np.float64]
+    """(blocks, 6N), reduced gradient of each block of the image, about their mean."""
 
 
 def correlation(
@@ -87,7 +89,7 @@ def correlation(
     S = reduction.S
     keep = np.repeat(free, 6)
     if not keep.any():
-        return Correlation(1.0, S, 0.0)
+        return Correlation(1.0, S, 0.0, np.zeros((1, len(S))))
     inner = S[np.ix_(keep, keep)]
     P = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])[np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
@@ -103,7 +105,36 @@ def correlation(
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, spread[0] / max(spread[1], 1e-300))
     T = max(factor * variance, 1e-30)
-    return Correlation(factor, S, float(eigh(T * P, inner + T * P, eigvals_only=True)[-1]))
+    owed = float(eigh(T * P, inner + T * P, eigvals_only=True)[-1])
+    whole = np.zeros((count, len(S)))
+    whole[:, keep] = scores[0]
+    return Correlation(factor, S, owed, whole)
+
+
+def beyond_scalar(
+    scores: NDArray[np.float64], S: NDArray[np.float64], variance: float
+) -> NDArray[np.float64]:
+    """Return the scatter of the gradient that blocks show beyond ``variance * S``.
+
+    One factor on the variance is too little for the directions in which the blocks' gradients add
+    up, such as a pattern that tilts all frames alike. Of as many blocks of independent points the
+    largest scatter relative to what is expected would be about ``(1 + sqrt(d / blocks))^2``
+    (Marchenko & Pastur 1967); directions above that count with what they show.
+
+    Args:
+        scores: (blocks, d), about their mean.
+        S: (d, d) reduced matrix.
+        variance: m^2, of a residual, with its inflation.
+    """
+    blocks, d = scores.shape
+    expected = variance * S
+    expected = expected + np.diag(1e-6 * np.diag(expected) + 1e-300)
+    root = np.linalg.cholesky(expected)
+    white = np.linalg.solve(root, scores.T)
+    values, vectors = eigh(white @ white.T)
+    above = values > (1 + np.sqrt(d / blocks)) ** 2
+    out = root @ vectors[:, above]
+    return np.asarray((out * (values[above] - 1)) @ out.T)
 
 
 def block_scores(
@@ -167,6 +198,7 @@ def assess(
     believed: bool,
     free: NDArray[np.bool_],
     frame_ids: tuple[int, ...],
+    known: Correlation | None = None,
 ) -> Certainty:
     """Turn the exact reduced matrix into covariances and a verdict on observability.
 
@@ -181,6 +213,8 @@ def assess(
         believed: whether the prior took part in the solution.
         free: (N,) frames that moved.
         frame_ids: ids of the frames.
+        known: how the residuals are correlated: what the blocks' gradients scatter beyond the
+            variance adds to the covariance.
     """
     n = len(free)
     keep = np.repeat(free, 6)
@@ -188,6 +222,10 @@ def assess(
     data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
     held = block_diag(*np.einsum("nji,njk,nkl->nil", J, prior.information, J))[np.ix_(keep, keep)]
     posterior = np.linalg.inv(data + held)
+    if known is not None and keep.any():
+        whole = known.S[np.ix_(keep, keep)]
+        scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30) ** 2
+        posterior = posterior + posterior @ scatter @ posterior
     weak = _weak_directions(posterior, held, free, frame_ids, problem)
     about_pivots = np.zeros((6 * n, 6 * n))
     # without belief in the prior a trace of it stays, so that open directions are large and not

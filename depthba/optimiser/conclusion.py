@@ -65,8 +65,9 @@ def conclude(
         engine.free, workers, sigma,
     )  # fmt: skip
     judged = certainty.assess(
-        level.problem, state, firm_lin, S, variance, prior, engine.preset.prior, engine.free, ids
-    )
+        level.problem, state, firm_lin, S, variance, prior, engine.preset.prior, engine.free, ids,
+        known,
+    )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
     status, reason = verdict(outcome, better, judged, frames, engine.clock)

@@ -7,7 +7,7 @@ import pytest
 
 from depthba.optimiser import eliminate
 from depthba.optimiser.bends import without_bends
-from depthba.optimiser.certainty import noise_sigma
+from depthba.optimiser.certainty import beyond_scalar, noise_sigma
 from depthba.optimiser.eliminate import Step
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
@@ -158,3 +158,20 @@ def test_points_at_a_step_are_left_out_and_no_others() -> None:
         share = frame.points[:, 4]
         assert not share[np.abs(at - 0.05) < 0.02].any()
         assert (share[np.abs(at - 0.05) > 0.06] == 1.0).all()
+
+
+def test_only_what_adds_up_over_blocks_widens_the_covariance() -> None:
+    """Independent scores add nothing; a pattern in one direction adds what it is, there alone."""
+    rng = np.random.default_rng(5)
+    d, blocks = 30, 48
+    root = np.tril(rng.standard_normal((d, d))) + 3 * np.eye(d)
+    S = root @ root.T
+    scores = rng.standard_normal((blocks, d)) @ root.T / np.sqrt(blocks)
+    assert not beyond_scalar(scores, S, 1.0).any()
+    u = root @ np.eye(d)[3]
+    pattern = scores + 40 * rng.standard_normal((blocks, 1)) * u / np.sqrt(blocks)
+    found = beyond_scalar(pattern, S, 1.0)
+    white = np.linalg.solve(root, np.linalg.solve(root, found).T)
+    values, vectors = np.linalg.eigh(white)
+    assert 800 < values[-1] < 2600 and np.abs(values[:-1]).max() < 1e-6 * values[-1]
+    assert abs(vectors[3, -1]) > 0.99
