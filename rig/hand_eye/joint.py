@@ -28,15 +28,11 @@ Array = NDArray[np.float64]
 # Rounds of strength and steps: the first strengths are found where the flanges are still as
 # reported.
 ROUNDS = 2
-STEPS = 20
+STEPS = 25
 # Settled when the proposed step of X is below this many of its standard deviations (root mean
 # square), and by how much a step may raise the cost.
-SETTLED = 0.05
+SETTLED = 0.1
 SLACK = 1e-3
-# Steps that are mixed, and the coefficients above which their history is not that of a linear
-# process.
-DEPTH = 3
-WILD = 10.0
 
 
 @dataclass(frozen=True)
@@ -91,13 +87,11 @@ def solve(
         return linearise(points, level.grid, state, loss, workers, level.smooth)
 
     lin = at(chain, heights, pattern)
-    reply: Answers | None = None
     for _ in range(ROUNDS):
         here = replace(level, problem=waves.without(problem, pattern) if m else problem)
         state = State(chain.T_map_camera, heights)
         worth = _weigh(here, state, loss, lin, stated, workers)
-        if reply is None:  # hardly changes afterwards, and takes a pass for each wave
-            reply = answers(here, state, loss, lin, waves, workers)
+        reply = answers(here, state, loss, lin, waves, workers)
         J = chain.jacobian(lin.pivots)
         seen = without_gauge(J, lin.pivots)
         newton, H = _information(seen, worth, reply)
@@ -109,8 +103,7 @@ def solve(
         def total(lin: Linearisation, now: Array, worth: Worth, variance: Array) -> float:
             return lin.cost + worth.temperature * float((now**2 / variance).sum())
 
-        metric = np.asarray(np.linalg.inv(covariance), float)
-        mixer, length, converged = Mixer(metric), 1.0, False
+        length, converged = 1.0, False
         for _ in range(STEPS):
             answer, gradient = _gradient(lin, seen, worth, reply, waves)
             now = _unknowns(chain, start, pattern)
@@ -118,7 +111,7 @@ def solve(
             converged = float(full[:6] @ np.linalg.solve(covariance[:6, :6], full[:6])) < (
                 6 * SETTLED**2
             )
-            step = length * mixer.mix(full)
+            step = length * full
             moved, bent = chain.moved(step[: len(step) - m]), pattern + step[len(step) - m :]
             poses = (J @ step[: len(step) - m]).reshape(-1, 6)
             back, _ = lin.C.solve(eliminate.spread(lin, poses), 1e-4)
@@ -132,10 +125,8 @@ def solve(
             accepted = after_cost <= before_cost * (1 + SLACK)
             if accepted:
                 chain, heights, pattern, lin = moved, raised, bent, after
-                mixer.took(step)
                 length = min(1.0, 2 * length)
             else:
-                mixer.forget()
                 length /= 4
             sigma = robust_sigma(lin.residuals)
             report(Iteration(level.grid.spacing, before_cost, step[:6], accepted, sigma))
@@ -162,39 +153,6 @@ class Worth:
     """(6N, 6N) that takes a reduced gradient to what is left of it without that noise."""
 
 
-class Mixer:
-    """Anderson mixing (type II) of steps, which converge linearly under a robust loss."""
-
-    def __init__(self, metric: Array) -> None:
-        """``metric`` (k, k) compares steps."""
-        self._metric = metric
-        self._proposed: list[Array] = []
-        self._taken: list[Array] = []
-
-    def mix(self, step: Array) -> Array:
-        """Return the step to take in place of the proposed one (k,)."""
-        self._proposed = [*self._proposed, step][-DEPTH - 1 :]
-        m = min(len(self._proposed) - 1, len(self._taken))
-        if m == 0:
-            return step
-        D = np.diff(np.stack(self._proposed[-m - 1 :]), axis=0)
-        gram = D @ self._metric @ D.T
-        gram += (1e-8 * np.trace(gram) + 1e-300) * np.eye(m)
-        theta = np.linalg.solve(gram, D @ self._metric @ step)
-        if not np.abs(theta).sum() < WILD:
-            return step
-        return np.asarray(step - theta @ (np.stack(self._taken[-m:]) + D))
-
-    def took(self, step: Array) -> None:
-        """Remember a step that was taken."""
-        self._taken = [*self._taken, step][-DEPTH:]
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._proposed.clear()
-        self._taken.clear()
-
-
 def _unknowns(chain: Chain, start: Start, pattern: Array) -> Array:
     return np.concatenate([start.error(chain), chain.zeros, chain.missed.ravel(), pattern])
 
@@ -216,6 +174,26 @@ def _gradient(
     pose = (lin.g_pose + eliminate.gather(lin, answer)).ravel()
     gradient = np.concatenate([J.T @ (worth.believed @ pose), reply.gradient(waves, lin)])
     return answer, gradient / worth.temperature
+
+
+def robust_excess(lin: Linearisation, loss: Loss, sigma: float) -> float:
+    """Return by how much the robust loss raises the variance that the normal equations state.
+
+    They hold the weights w where the score's variance calls for ``w^2 r^2`` and its slope for the
+    derivative of ``w r`` (Huber 1964), which for Geman-McClure is ``w (1 - 3 u) / (1 + u)`` with
+    ``u = r^2 / c^2``.
+    """
+    if loss.robust_c == 0.0 or sigma == 0.0:
+        return 1.0
+    w = np.concatenate(lin.weights).astype(np.float64)
+    square = np.nan_to_num(np.concatenate(lin.residuals)).astype(np.float64) ** 2
+    u = square / loss.robust_c**2
+    inside = u < 1.0  # strays are no part of what is uncertain about the rest
+    w, square, u = w[inside & (w > 0)], square[inside & (w > 0)], u[inside & (w > 0)]
+    slope = float(np.mean(w * (1 - 3 * u) / (1 + u)))
+    if slope <= 0.0:
+        return 1.0
+    return max(1.0, float(np.mean(w**2 * square)) / sigma**2 * float(np.mean(w)) / slope**2)
 
 
 def _weigh(
@@ -242,7 +220,7 @@ def _weigh(
         for f in level.problem.frames
     ]
     sigma = certainty.noise_sigma(level.problem, level.grid, state, loss, lin)
-    variance = sigma**2
+    variance = sigma**2 * robust_excess(lin, loss, sigma)
     everywhere = np.ones(n, bool)
     scores = certainty.block_scores(
         level.problem, level.grid, state, loss, lin, groups, workers, reduction

@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 
 # How far points are moved to see what that does, m.
 DELTA = 2e-4
+# How much farther a wave may move a point, and which share of that a bend in its residual may be.
+FAR = 3.0
+LEAP = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,46 +125,41 @@ def answers(
     for the walk there being cut short: both ways differ, and their mean is taken.
     """
     frozen = replace(loss, robust_c=0.0)
-    weighted = tuple(
-        replace(f, points=_times(f.points, w))
-        for f, w in zip(level.problem.frames, lin.weights, strict=True)
-    )
-    problem = replace(level.problem, frames=weighted)
 
-    def at(waves: Waves, pattern: Array) -> Linearisation:
+    def at(problem: Problem, waves: Waves, pattern: Array) -> Linearisation:
         moved = waves.without(problem, pattern)
         return linearise(moved, level.grid, state, frozen, workers, level.smooth)
 
-    def both(waves: Waves, k: int) -> tuple[Linearisation, Linearisation]:
-        one = DELTA * np.eye(waves.count)[k]
-        return at(waves, -one), at(waves, one)
-
-    before, after = both(Waves(tuple(np.ones((len(f), 1), np.float32) for f in problem.frames)), 0)
+    # all points moved alike, and far enough for every wave
+    even = Waves(tuple(np.ones((len(f), 1), np.float32) for f in level.problem.frames))
+    three = [at(level.problem, even, np.array([k * FAR * DELTA])) for k in (-1, 0, 1)]
     m = waves.count
     own = np.zeros((m, m))
-    pulls = []
-    for wave, a, b, weight, frame in zip(
-        waves.at, before.residuals, after.residuals, lin.weights, level.problem.frames, strict=True
+    frames, pulls = [], []
+    for wave, frame, weight, *residuals in zip(
+        waves.at, level.problem.frames, lin.weights, *(one.residuals for one in three), strict=True
     ):
-        # the residual falls as the point is moved back by what is taken for the pattern
-        change = np.nan_to_num((b - a) / np.float32(2 * DELTA))
-        pulls.append((frame.points[:, 4] * change).astype(np.float32))
-        w = (weight * pulls[-1] * change).astype(np.float32)
-        own += wave.T @ (w[:, None] * wave)
+        before, here, after = (np.nan_to_num(r) for r in residuals)
+        change = (after - before) / np.float32(2 * FAR * DELTA)
+        bent = (after + before - 2 * here) / np.float32(2 * FAR * DELTA)
+        # a point whose walk leaps to another foot has no derivative
+        steady = (np.abs(change) < 1.1 * frame.points[:, 3]) & (
+            np.abs(bent) < LEAP * frame.points[:, 3]
+        )
+        points = frame.points.copy()
+        points[:, 4] *= weight * steady
+        frames.append(replace(frame, points=points))
+        pulls.append((frame.points[:, 4] * steady * change).astype(np.float32))
+        own += wave.T @ ((points[:, 4] * change**2)[:, None] * wave)
+    problem = replace(level.problem, frames=tuple(frames))
     pose = np.zeros((lin.g_pose.size, m))
     fields, back = (np.zeros((m, *lin.g_map.shape), np.float32) for _ in range(2))
     for k in range(m):
-        before, after = both(waves, k)
-        field = (after.g_map - before.g_map) / (2 * DELTA)
+        minus, plus = (at(problem, waves, sign * DELTA * np.eye(m)[k]) for sign in (-1, 1))
+        field = (plus.g_map - minus.g_map) / (2 * DELTA)
         answer, _ = lin.C.solve(field, 1e-4)
         fields[k], back[k] = field, answer
-        coupled = (after.g_pose - before.g_pose) / (2 * DELTA) - eliminate.gather(lin, answer)
+        coupled = (plus.g_pose - minus.g_pose) / (2 * DELTA) - eliminate.gather(lin, answer)
         pose[:, k] = coupled.ravel()
     own -= np.tensordot(fields, back, ((1, 2), (1, 2)))
     return Answers(back, tuple(pulls), (own + own.T) / 2, pose)
-
-
-def _times(points: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    out = points.copy()
-    out[:, 4] *= weight
-    return out
