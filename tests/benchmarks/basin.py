@@ -187,29 +187,26 @@ def table(runs: list[Run]) -> str:
 def plot(runs: list[Run], path: Path) -> None:
     """Draw the share of starts that succeed against how far off they are."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     names = list(dict.fromkeys(r.dataset for r in runs))
-    figure = Figure(figsize=(4.6 * len(names), 3.6), layout="constrained")
+    figure = Figure(figsize=(5.2 * len(names), 4.0), layout="constrained")
     axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     found = rows(runs)
     for axis, name in zip(axes, names, strict=True):
-        for method in METHODS:
-            mine = [(MAGNITUDES.index(r[2]), r[3] / r[4]) for r in found if r[:2] == (name, method)]
-            if mine:
-                at, share = zip(*mine, strict=True)
-                side = 0.02 * (METHODS.index(method) - 1)  # equal shares stay apart
-                axis.plot(
-                    at, 100 * np.array(share) + 100 * side, "o-", label=NAMES[method],
-                    color=COLOURS[method], linewidth=2,
-                )  # fmt: skip
+        for k, method in enumerate(METHODS):
+            for _, _, off, good, count, *_ in (r for r in found if r[:2] == (name, method)):
+                at, share = MAGNITUDES.index(off) + 0.28 * (k - 1), 100 * good / count
+                axis.bar(at, max(share, 0.6), 0.26, color=COLOURS[method])
+                axis.text(at, share + 2, f"{good}/{count}", ha="center", fontsize=7)
         ticks = [f"{1e3 * t:.0f} mm\n{1e3 * r:.0f} mrad" for t, r in MAGNITUDES]
         axis.set_xticks(range(len(MAGNITUDES)), ticks)
         axis.set_title(name)
         axis.set_xlabel("start poses off by (standard deviation per axis)")
-        axis.grid(alpha=0.3)
-        axis.set_ylim(-6, 106)
+        axis.set_ylim(0, 110)
     axes[0].set_ylabel("starts that succeed, %")
-    axes[-1].legend(loc="lower left")
+    handles = [Patch(color=COLOURS[m], label=NAMES[m]) for m in METHODS]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(METHODS))
     figure.savefig(path, dpi=110)
 
 
