@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from depthba.dataset import Dataset
 from depthba.errors import DatasetError, OptionError
-from depthba.optimiser import eliminate, kernels, schedule
+from depthba.optimiser import kernels, reduced, schedule
+from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid, average, filled, make_grid, near
 from depthba.optimiser.linearise import (
     Linearisation,
@@ -184,14 +185,14 @@ def _cleaned(problem: Problem, dataset: Dataset, clean: Sequence[NDArray[np.floa
 
 def _of_clean(problem: Problem, spacing: float, workers: Workers) -> tuple[Floats, Linearisation]:
     problem, _, _, _, lin = _fitted(problem, spacing, workers)
-    return eliminate.exact(lin, workers, TOLERANCE), lin
+    return reduced.exact(lin, workers, TOLERANCE), lin
 
 
 def _of_noisy(problem: Problem, spacing: float, workers: Workers) -> tuple[Floats, Linearisation]:
     problem, grid, state, loss, lin = _fitted(problem, spacing, workers)
     noise = noise_linearisation(problem, grid, state, loss, lin, workers)
-    S = eliminate.exact(lin, workers, TOLERANCE)
-    S -= (problem.noise or 0.0) ** 2 * eliminate.exact(noise, workers, 1e-3)
+    S = reduced.exact(lin, workers, TOLERANCE)
+    S -= (problem.noise or 0.0) ** 2 * reduced.exact(noise, workers, 1e-3)
     return S / _kept_of_noise(schedule.PRESETS["default"].robust), lin
 
 
@@ -234,33 +235,22 @@ def _by_range(problem: Problem, grid: Grid, state: State, loss: Loss) -> Problem
     """
     if not loss.along_ray:
         return problem
-    nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
+    ground = Ground(problem, grid, state, replace(loss, along_ray=False))
     fronts = fronts_of(problem, state.T_map_camera)
 
-    def weighed(frame: FramePoints, T: Floats, front: float) -> FramePoints:
+    def weighed(i: int) -> FramePoints:
+        frame, feet = problem.frames[i], ground.feet(i)
         if not len(frame):
             return frame
-        q = frame.points[:, :3] @ T[:3, :3].T
-        u = q / np.linalg.norm(q, axis=1, keepdims=True)
-        cell = (q[:, :2] + T[:2, 3] - grid.origin) / grid.spacing
-        corner = np.clip(np.floor(cell).astype(int), 0, [grid.shape[1] - 2, grid.shape[0] - 2])
-        a, b = np.clip(cell - corner, 0.0, 1.0).T[..., None]
-        x, y = corner.T
-        slope = (1 - b) * ((1 - a) * nodes[y, x, 1:] + a * nodes[y, x + 1, 1:]) + b * (
-            (1 - a) * nodes[y + 1, x, 1:] + a * nodes[y + 1, x + 1, 1:]
-        )
-        nu = front * (u[:, 2] - (slope * u[:, :2]).sum(axis=1))
-        normal = 1.0 + (slope**2).sum(axis=1)
+        u = feet.arms / np.linalg.norm(feet.arms, axis=0)
+        nu = fronts[i] * (u[2] - (feet.slopes * u[:2]).sum(axis=0))
+        normal = 1.0 + (feet.slopes**2).sum(axis=0)
         asked = np.maximum(nu, kernels.GRAZING)
         points = frame.points.copy()
         points[:, 3] *= np.sqrt(nu**2 + kernels.LATERAL * normal) / asked
         return replace(frame, points=points)
 
-    frames = tuple(
-        weighed(f, T, front)
-        for f, T, front in zip(problem.frames, state.T_map_camera, fronts, strict=True)
-    )
+    frames = tuple(weighed(i) for i in range(len(problem.frames)))
     return replace(problem, frames=frames)
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, eigh
 
-from depthba.optimiser import eliminate, kernels
+from depthba.optimiser import coupling, probes, reduced
+from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
-from depthba.optimiser.linearise import Linearisation, Loss, State, fronts_of, robust_sigma
+from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
 from depthba.optimiser.workers import Workers
@@ -34,16 +35,15 @@ def noise_sigma(
     noise: each is divided by the root of what its leverage leaves (the externally known part of a
     studentised residual, Cook & Weisberg 1982).
     """
-    nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
-    fronts = fronts_of(problem, state.T_map_camera)
+    ground = Ground(problem, grid, state, loss)
     found = []
-    for i, (frame, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True)):
+    for i, frame in enumerate(problem.frames):
         stride = max(1, len(frame) // SAMPLE)
-        pull = np.empty(len(frame.points[::stride]))
-        kernels.leverages(
-            frame.points, stride, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing,
-            nodes, loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i], lin.C.own, pull,
+        feet, some = ground.feet(i, stride), frame.points[::stride]
+        pull = np.empty(len(some))
+        probes.leverages(
+            some, feet.on, feet.cells, feet.fractions, feet.norm2, lin.weights[i][::stride],
+            lin.C.own, pull,
         )  # fmt: skip
         free = pull < FOLLOWED
         found.append(np.abs(lin.residuals[i][::stride][free]) / np.sqrt(1.0 - pull[free]))
@@ -74,7 +74,7 @@ def correlation(
     prior: PosePrior,
     free: NDArray[np.bool_],
     workers: Workers,
-    reduction: eliminate.Reduction | None = None,
+    reduction: reduced.Reduction | None = None,
 ) -> Correlation:
     """Measure how the residuals' correlation over the image inflates the variance of the poses.
 
@@ -85,7 +85,7 @@ def correlation(
     the prior P, so that the directions count that the data hold least. The prior's weight T depends
     on the factor in turn, which a few rounds settle.
     """
-    reduction = reduction or eliminate.reduce(lin, workers)
+    reduction = reduction or reduced.reduce(lin, workers)
     S = reduction.S
     keep = np.repeat(free, 6)
     if not keep.any():
@@ -145,16 +145,14 @@ def block_scores(
     lin: Linearisation,
     groups: list[NDArray[np.uint8]],
     workers: Workers,
-    reduction: eliminate.Reduction,
+    reduction: reduced.Reduction,
 ) -> NDArray[np.float64]:
     """Return the reduced gradient of each group of points, (kinds, groups, 6N).
 
     The map has answered to it. ``groups`` says for each frame, (kinds, n), which group a point is
     in, for one or several ways to group them.
     """
-    nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
-    fronts = fronts_of(problem, state.T_map_camera)
+    ground = Ground(problem, grid, state, loss)
     shape = len(groups[0]), BLOCKS[0] * BLOCKS[1], 6
     answers = reduction.answers
 
@@ -162,17 +160,17 @@ def block_scores(
         scores = np.zeros((len(problem.frames), *shape))
         for i in frames:
             frame, T, foot = problem.frames[i], state.T_map_camera[i], lin.B[i]
-            cells, shares = np.empty((len(frame), 2), np.int32), np.empty((len(frame), 3))
-            kernels.contributions(
-                frame.points, T[:3, :3].copy(), T[:3, 3].copy(), T[:3, 3] - lin.pivots[i],
-                grid.origin, grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap,
-                lin.weights[i], groups[i], cells, shares, scores[i],
+            feet, pulls = ground.feet(i), np.empty(len(frame))
+            probes.contributions(
+                frame.points, feet.on, feet.arms, feet.slopes, feet.norm2, feet.residuals,
+                T[:3, 3] - lin.pivots[i], lin.weights[i], groups[i], pulls, scores[i],
             )  # fmt: skip
             for other, answer in enumerate(answers):
-                if eliminate.meet(foot, answer):
-                    kernels.answered(
-                        cells, shares, groups[i], answer.values, answer.x, answer.y, scores[other]
-                    )
+                if coupling.meet(foot, answer):
+                    probes.answered(
+                        feet.cells, feet.fractions, pulls, groups[i], answer.values, answer.x,
+                        answer.y, scores[other],
+                    )  # fmt: skip
         return scores
 
     total = sum(workers.map(of, workers.shares(problem)), start=np.zeros((1, 1, 1, 1)))

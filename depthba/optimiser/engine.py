@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from depthba.optimiser import certainty, eliminate, schedule
+from depthba.optimiser import certainty, reduced, schedule
 from depthba.optimiser.bends import without_bends
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
@@ -121,7 +121,7 @@ class Engine:
                 self.workers, 1, NEAR,
             )  # fmt: skip
             for phase in phases(1 if refining else index, self.preset):
-                near = eliminate.reduce(lin, self.workers, NEAR, self.free)
+                near = reduced.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
@@ -173,7 +173,7 @@ class Engine:
         if self.preset.robust:
             problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
         lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
-        at = eliminate.reduce(lin, self.workers, free=self.free)
+        at = reduced.reduce(lin, self.workers, free=self.free)
         found = certainty.correlation(
             problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at
         )
@@ -229,7 +229,7 @@ class Engine:
         return None if less is S else less
 
     def _correlation(
-        self, level: Level, state: State, lin: Linearisation, at: eliminate.Reduction
+        self, level: Level, state: State, lin: Linearisation, at: reduced.Reduction
     ) -> certainty.Correlation:
         return certainty.correlation(
             level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import kernels
+from depthba.optimiser import map_kernels
 from depthba.optimiser.grid import Grid, average, filled, make_grid
 from depthba.optimiser.problem import Problem
 
@@ -55,13 +55,13 @@ def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
     Pooled over frames.
     """
     nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(
+    map_kernels.nodal_gradients(
         filled(average(problem, T_map_camera, grid).heights), grid.spacing, nodes
     )
     squares, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         total, square, count = (np.zeros(grid.shape) for _ in range(3))
-        kernels.splat_residuals(
+        map_kernels.splat_residuals(
             frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes,
             total, square, count,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import kernels
+from depthba.optimiser import kernels, map_kernels
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.stencil import Stencil
@@ -153,7 +153,7 @@ def linearise(
     bands = workers.bands(grid.shape[0])
 
     def nodes_of(band: tuple[int, int]) -> None:
-        kernels.nodal_rows(state.heights, grid.spacing, scratch.nodes, *band)
+        map_kernels.nodal_rows(state.heights, grid.spacing, scratch.nodes, *band)
 
     def share(frames: range, total: NDArray[np.float64]) -> None:
         total.fill(0.0)
@@ -173,7 +173,7 @@ def linearise(
     C = Stencil.empty(grid.shape) if spare is None else spare.C
     g_map = np.empty(grid.shape) if spare is None else spare.g_map
     rough = workers.map(
-        lambda band: kernels.collect(
+        lambda band: map_kernels.collect(
             scratch.totals, state.heights, smooth, loss.smoothing, *band,
             C.own, C.right, C.up, C.up_right, C.up_left, g_map,
         ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import kernels
+from depthba.optimiser import map_kernels
 from depthba.optimiser.grid import make_grid
 from depthba.optimiser.problem import Problem
 
@@ -28,7 +28,7 @@ def overlap_matrix(
     for i, (frame, T) in enumerate(zip(problem.frames, T_map_camera, strict=True)):
         n = np.zeros(grid.shape)
         unused = np.zeros(grid.shape)
-        kernels.splat(
+        map_kernels.splat(
             frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, unused, n
         )
         seen[i] = (n > 0).ravel()

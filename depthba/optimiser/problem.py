@@ -217,7 +217,7 @@ def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) ->
     weighted[:, 3] = weight
     centroid = points.mean(axis=0, dtype=float)
     extent = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
-    return FramePoints(weighted, _blocks(points, sensor), centroid, _extremes(points), extent)
+    return FramePoints(weighted, _blocks(points, sensor), centroid, extremes(points), extent)
 
 
 def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
@@ -237,7 +237,7 @@ def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
     return np.asarray(rows * BLOCKS[0] + columns, np.uint8)
 
 
-def _extremes(points: NDArray[np.float32]) -> NDArray[np.float64]:
+def extremes(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the extreme points along directions spread over the sphere (Fibonacci lattice)."""
     n = 128
     k = np.arange(n) + 0.5

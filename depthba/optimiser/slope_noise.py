@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from depthba.optimiser import eliminate, kernels
+from depthba.optimiser import map_kernels, probes, reduced
+from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import (
     Footprint,
     Linearisation,
     Loss,
     State,
-    fronts_of,
     robust_sigma,
 )
 from depthba.optimiser.problem import Problem
@@ -78,7 +78,7 @@ def without_slope_noise(
     found = _largest_share(bound[keep], (S + held)[keep])
     if found < share:
         return S, found
-    noise = variance * eliminate.exact(noisy, workers, ROUGHLY)
+    noise = variance * reduced.exact(noisy, workers, ROUGHLY)
     found = _largest_share(noise[keep], (S + held)[keep])
     if found < share:
         return S, found
@@ -121,36 +121,28 @@ def noise_linearisation(
     workers: Workers,
 ) -> Linearisation:
     """Normal equations whose Jacobians hold the gradient of a map drawn from unit noise alone."""
-    nodes = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(state.heights, grid.spacing, nodes)
-    fronts = fronts_of(problem, state.T_map_camera)
+    ground = Ground(problem, grid, state, loss)
     rng = np.random.default_rng(0)
-    draws = [rng.standard_normal(len(f)) for f in problem.frames]
     count = len(problem.frames)
-    poses = [(T[:3, :3].copy(), T[:3, 3].copy()) for T in state.T_map_camera]
-
-    def drawn(i: int) -> NDArray[np.float64]:
-        field = np.zeros(grid.shape)
-        kernels.noise_gradient(
-            problem.frames[i].points, *poses[i], grid.origin, grid.spacing, nodes,
-            loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i], draws[i], field,
-        )  # fmt: skip
-        return field
-
     total = np.zeros(grid.shape)
-    for i in range(count):
-        total += drawn(i)
+    for i, frame in enumerate(problem.frames):
+        feet = ground.feet(i)
+        probes.noise_gradient(
+            frame.points, feet.on, feet.cells, feet.fractions, feet.norm2, lin.weights[i],
+            rng.standard_normal(len(frame)), total,
+        )  # fmt: skip
     heights, _ = lin.C.solve(-total, 1e-4)
     noise = np.empty((*grid.shape, 3))
-    kernels.nodal_gradients(heights, grid.spacing, noise)
+    map_kernels.nodal_gradients(heights, grid.spacing, noise)
     A = np.zeros((count, 6, 6))
     B = tuple(Footprint(f.y, f.x, np.zeros_like(f.values)) for f in lin.B)
 
     def filled(i: int) -> None:
-        kernels.slope_noise(
-            problem.frames[i].points, *poses[i], poses[i][1] - lin.pivots[i], grid.origin,
-            grid.spacing, nodes, loss.along_ray, loss.slope, fronts[i], loss.cap, lin.weights[i],
-            noise, A[i], B[i].values, B[i].x, B[i].y,
+        feet, frame = ground.feet(i), problem.frames[i]
+        probes.slope_noise(
+            frame.points, feet.on, feet.cells, feet.fractions, feet.arms, feet.norm2,
+            state.T_map_camera[i, :3, 3] - lin.pivots[i], lin.weights[i], noise, A[i],
+            B[i].values, B[i].x, B[i].y,
         )  # fmt: skip
 
     workers.map(filled, range(count))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import eliminate
+from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.mixing import Mixer
@@ -144,8 +144,8 @@ def solve_level(
             break
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
-        direct = sure is None and eliminate.direct_is_shorter(lin)
-        here = eliminate.reduce(lin, workers, free=free) if direct else None
+        direct = sure is None and reduced.direct_is_shorter(lin)
+        here = reduced.reduce(lin, workers, free=free) if direct else None
         step = eliminate.solve(
             lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here, sure
         )

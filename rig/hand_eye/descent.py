@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.optimiser import eliminate
+from depthba.optimiser import coupling
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.solver import solve_map
@@ -115,7 +115,7 @@ def descend(
         J = chain.by_hand_eye(lin.pivots)
         held = temperature / start.sigma**2
         seen = without_gauge(J, lin.pivots)
-        gradient = seen.T @ (lin.g_pose + eliminate.gather(lin, answer)).ravel()
+        gradient = seen.T @ (lin.g_pose + coupling.gather(lin, answer)).ravel()
         gradient += held * start.error(chain)
         through, M = responses(lin, J, seen, workers)
         M += np.diag(held)
@@ -156,8 +156,8 @@ def responses(lin: Linearisation, J: Array, seen: Array, workers: Workers) -> tu
 
     def one(column: Array) -> tuple[Array, Array]:
         pose = column.reshape(n, 6)
-        field, _ = lin.C.solve(eliminate.spread(lin, pose), 1e-3)
-        product = np.einsum("nij,nj->ni", lin.A, pose) - eliminate.gather(lin, field)
+        field, _ = lin.C.solve(coupling.spread(lin, pose), 1e-3)
+        product = np.einsum("nij,nj->ni", lin.A, pose) - coupling.gather(lin, field)
         return field, product.ravel()
 
     fields, products = zip(*workers.map(one, list(J.T)), strict=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import certainty, eliminate
+from depthba.optimiser import certainty, coupling, reduced
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.problem import BLOCKS
@@ -114,7 +114,7 @@ def solve(
             step = length * full
             moved, bent = chain.moved(step[: len(step) - m]), pattern + step[len(step) - m :]
             poses = (J @ step[: len(step) - m]).reshape(-1, 6)
-            back, _ = lin.C.solve(eliminate.spread(lin, poses), 1e-4)
+            back, _ = lin.C.solve(coupling.spread(lin, poses), 1e-4)
             raised = heights + answer - back
             if m:
                 raised -= np.tensordot(step[len(step) - m :], reply.back, 1)
@@ -171,7 +171,7 @@ def _gradient(
 ) -> tuple[Array, Array]:
     """Return the map's step for fixed unknowns (ny, nx), and the gradient with it (k,)."""
     answer, _ = lin.C.solve(-lin.g_map, 1e-4)
-    pose = (lin.g_pose + eliminate.gather(lin, answer)).ravel()
+    pose = (lin.g_pose + coupling.gather(lin, answer)).ravel()
     gradient = np.concatenate([J.T @ (worth.believed @ pose), reply.gradient(waves, lin)])
     return answer, gradient / worth.temperature
 
@@ -205,7 +205,7 @@ def _weigh(
     groups' gradients compared with that of as many groups of single points: so far as neighbours in
     one frame err alike, the former is larger. What all frames have in common is the pattern's.
     """
-    reduction = eliminate.reduce(lin, workers)
+    reduction = reduced.reduce(lin, workers)
     S = reduction.S
     n = len(level.problem.frames)
     rng = np.random.default_rng(0)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.dataset import Sensor
-from depthba.optimiser import eliminate
+from depthba.optimiser import coupling
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
 from depthba.optimiser.problem import BLOCKS, Problem
@@ -159,7 +159,7 @@ def answers(
         field = (plus.g_map - minus.g_map) / (2 * DELTA)
         answer, _ = lin.C.solve(field, 1e-4)
         fields[k], back[k] = field, answer
-        coupled = (plus.g_pose - minus.g_pose) / (2 * DELTA) - eliminate.gather(lin, answer)
+        coupled = (plus.g_pose - minus.g_pose) / (2 * DELTA) - coupling.gather(lin, answer)
         pose[:, k] = coupled.ravel()
     own -= np.tensordot(fields, back, ((1, 2), (1, 2)))
     return Answers(back, tuple(pulls), (own + own.T) / 2, pose)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from depthba import se3
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
-from depthba.optimiser.problem import FramePoints, Problem
+from depthba.optimiser.problem import FramePoints, Problem, extremes
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def frame_points(cloud: Floats) -> FramePoints:
     centroid = xyz.mean(axis=0)
     extent = float(np.sqrt(((xyz - centroid) ** 2).sum(axis=1).mean()))
     blocks = (np.arange(len(points)) % 48).astype(np.uint8)
-    return FramePoints(points, blocks, centroid, xyz, extent)
+    return FramePoints(points, blocks, centroid, extremes(points[:, :3]), extent)
 
 
 def problem_of(clouds: list[Floats], T_map_camera: Floats, spacing: float = 0.02) -> Problem:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from depthba.optimiser import eliminate
+from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.linearise import Linearisation, Workers, linearise
 from tests.depthba.optimiser_problems import (
     LOSSES,
@@ -57,13 +57,13 @@ def test_stencil_solves(lin: Linearisation) -> None:
 def test_exact_agrees_with_dense(lin: Linearisation) -> None:
     want = schur(lin)
     atol = 1e-8 * np.abs(want).max()
-    np.testing.assert_allclose(eliminate.exact_sparse(lin), want, atol=atol)
-    np.testing.assert_allclose(eliminate.exact(lin, Workers(1), 1e-12), want, atol=atol)
-    np.testing.assert_allclose(eliminate.exact(lin, Workers(1)), want, atol=atol)
+    np.testing.assert_allclose(reduced.exact_sparse(lin), want, atol=atol)
+    np.testing.assert_allclose(reduced.exact(lin, Workers(1), 1e-12), want, atol=atol)
+    np.testing.assert_allclose(reduced.exact(lin, Workers(1)), want, atol=atol)
 
 
 def test_lumped_bounds_exact_from_above(lin: Linearisation) -> None:
-    S, bound = schur(lin), eliminate.lumped(lin, Workers(1))
+    S, bound = schur(lin), reduced.lumped(lin, Workers(1))
     np.testing.assert_allclose(bound, bound.T, atol=1e-12 * np.abs(bound).max())
     assert np.linalg.eigvalsh(bound - S).min() >= -1e-10 * np.abs(S).max()
     # and S itself has no negative direction, which the damping relies upon
@@ -82,7 +82,7 @@ def test_step_agrees_with_dense(lin: Linearisation, damping: float) -> None:
     workers = Workers(1)
     step = eliminate.solve(lin, free, prior, damping, workers, 1e-10, 200)
     H, g = dense_of(lin)
-    bound = eliminate.lumped(lin, workers)
+    bound = reduced.lumped(lin, workers)
     for i in range(n):
         window = slice(6 * i, 6 * i + 6)
         H[window, window] += prior[0][i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from depthba.optimiser import eliminate
+from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.bends import without_bends
 from depthba.optimiser.certainty import beyond_scalar, noise_sigma
 from depthba.optimiser.eliminate import Step
@@ -65,17 +65,17 @@ def test_window_is_solved_as_if_the_rest_stood_still() -> None:
 
 
 def test_loose_tolerance_leaves_an_error_of_second_order(lin: Linearisation) -> None:
-    want = eliminate.exact_sparse(lin)
+    want = reduced.exact_sparse(lin)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
     coarse, fine = (
-        np.abs((eliminate.reduce(lin, Workers(1), t).S - want) / scale).max() for t in (1e-2, 1e-4)
+        np.abs((reduced.reduce(lin, Workers(1), t).S - want) / scale).max() for t in (1e-2, 1e-4)
     )
     assert coarse < 1e-2 and fine < 1e-5
 
 
 def test_frames_that_stand_still_are_left_out(lin: Linearisation) -> None:
     free = np.array([False, True, True, False])
-    whole, part = (eliminate.reduce(lin, Workers(1), 1e-8, f).S for f in (None, free))
+    whole, part = (reduced.reduce(lin, Workers(1), 1e-8, f).S for f in (None, free))
     keep = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
     np.testing.assert_allclose(part[keep], whole[keep], rtol=1e-12)
 
@@ -85,8 +85,8 @@ def test_both_roads_lead_to_the_same_step(lin: Linearisation) -> None:
     n, workers = len(lin.A), Workers(1)
     free = np.arange(n) > 0
     nothing = np.repeat(np.eye(6)[None], n, axis=0), np.zeros((n, 6))
-    here = eliminate.reduce(lin, workers, 1e-8)
-    elsewhere = eliminate.reduce(lin, workers, 1e-2).S + 0.1 * np.diag(np.diag(here.S))
+    here = reduced.reduce(lin, workers, 1e-8)
+    elsewhere = reduced.reduce(lin, workers, 1e-2).S + 0.1 * np.diag(np.diag(here.S))
     direct = eliminate.solve(lin, free, nothing, 0.0, workers, 1e-9, 0, here=here)
     iterative = eliminate.solve(lin, free, nothing, 0.0, workers, 1e-9, 200, near=elsewhere)
     for one, other in ((direct.pose, iterative.pose), (direct.map, iterative.map)):
@@ -98,7 +98,7 @@ def test_step_without_noise_in_it_is_the_plain_one(lin: Linearisation) -> None:
     n, workers = len(lin.A), Workers(1)
     free = np.arange(n) > 0
     prior = np.repeat(np.eye(6)[None], n, axis=0), np.full((n, 6), 0.1)
-    here = eliminate.reduce(lin, workers, 1e-8)
+    here = reduced.reduce(lin, workers, 1e-8)
     plain = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, here=here)
     sure = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=here.S)
     np.testing.assert_allclose(sure.pose, plain.pose, atol=1e-5 * np.abs(plain.pose).max())

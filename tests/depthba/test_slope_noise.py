@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from depthba.optimiser import kernels
+from depthba.optimiser import kernels, probes
+from depthba.optimiser.feet import Feet
 from depthba.optimiser.slope_noise import MARGIN, _less
 
 
@@ -18,8 +19,11 @@ def test_jacobians_of_slope_noise_against_plain_numpy() -> None:
     R, t = np.diag([1.0, -1.0, -1.0]), np.array([0.03, -0.02, 1.0])
     arm, weights = np.array([0.1, 0.2, 0.9]), rng.uniform(0.1, 1.0, 50).astype(np.float32)
     A, B = np.zeros((6, 6)), np.zeros((21, 21, 6))
-    kernels.slope_noise(
-        points, R, t, arm, origin, spacing, nodes, False, False, 1.0, 0.2, weights, noise,
+    rows, cells = np.empty((kernels.ROWS, 50)), np.empty((2, 50), np.int32)
+    kernels.feet(points, R, t, origin, spacing, nodes, False, False, 1.0, 0.2, rows, cells)
+    feet = Feet(rows, cells)
+    probes.slope_noise(
+        points, feet.on, cells, feet.fractions, feet.arms, feet.norm2, arm, weights, noise,
         A, B, 0, 0,
     )  # fmt: skip
     expected, coupled = np.zeros((6, 6)), np.zeros((21, 21, 6))
