@@ -56,7 +56,9 @@ def conclude(
     better = cost_end <= cost_start
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")
-    firm, firm_lin, known = engine.known_at(level, state, outcome.loss)
+    found = end.known if better else None
+    found = found or engine.known_at(level, state, outcome.loss)
+    firm, firm_lin, known = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
     variance = known.inflation * sigma**2
     held_by_prior = block_diag(*prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0])

@@ -72,7 +72,7 @@ def solve(
             ``S0 S^-1 g``: where noise is all there is, the measured poses stand.
     """
     n = len(lin.B)
-    inner = min(1e-3, 0.1 * tolerance)
+    inner = 0.1 * tolerance
     solver = MapSolver(lin.C, inner, workers)
     answer, _ = solver.solve(-lin.g_map, inner)
     g = lin.g_pose + gather(lin, answer, workers)

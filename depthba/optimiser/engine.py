@@ -54,6 +54,16 @@ class Map:
 
 
 @dataclass(frozen=True)
+class Known:
+    """What the points say at a state, but for those that must not vouch for it."""
+
+    problem: Problem
+    """Without the points at sharp bends."""
+    lin: Linearisation
+    correlation: certainty.Correlation
+
+
+@dataclass(frozen=True)
 class End:
     """Where the last level ended, and what is known there."""
 
@@ -61,6 +71,8 @@ class End:
     outcome: Outcome
     temperature: float
     """m^2, what a squared normalised error of a measured pose cost."""
+    known: Known | None = None
+    """What the points say there, if that was found out."""
 
 
 @dataclass
@@ -129,17 +141,9 @@ class Engine:
                 sure = self._sure(level, state, lin, near.S, temperature)
                 final = last and phase == phases(1, self.preset)[-1]
                 outcome = self._solve(
-                    level,
-                    state,
-                    phase,
-                    index,
-                    len(levels),
-                    temperature,
-                    believed,
-                    near.S,
-                    sure,
-                    final,
-                )
+                    level, state, lin, phase, index, len(levels), temperature, believed, near.S,
+                    sure, final,
+                )  # fmt: skip
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
@@ -150,25 +154,20 @@ class Engine:
         if not judged:
             return End(level, outcome, temperature)
         for _ in range(AGAIN):
-            found = self.known_at(level, outcome.state, outcome.loss)[2]
-            if not outcome.converged or found.inflation > 0.5 * believed:
-                break
-            believed = found.inflation
+            there = self.known_at(level, outcome.state, outcome.loss)
+            inflation = there.correlation.inflation
+            if not outcome.converged or inflation > 0.5 * believed:
+                return End(level, outcome, temperature, there)
+            believed = inflation
             outcome = self._solve(
-                level, outcome.state, phase, index, len(levels), temperature, believed, near.S,
-                sure, True,
+                level, outcome.state, outcome.lin, phase, index, len(levels), temperature,
+                believed, near.S, sure, True,
             )  # fmt: skip
             self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature)
 
-    def known_at(
-        self, level: Level, state: State, loss: Loss
-    ) -> tuple[Problem, Linearisation, certainty.Correlation]:
-        """Return what the points say at a state, but for those that must not vouch for it.
-
-        That is the problem without the points at sharp bends, its linearisation, and how
-        correlated their residuals are.
-        """
+    def known_at(self, level: Level, state: State, loss: Loss) -> Known:
+        """Return what the points say at a state, but for those that must not vouch for it."""
         problem = level.problem
         if self.preset.robust:
             problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
@@ -178,7 +177,7 @@ class Engine:
             problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at
         )
         self.clock.lap("certainty")
-        return problem, lin, found
+        return Known(problem, lin, found)
 
     def _no_finer(self, levels: list[float], index: int, deviation: float) -> list[float]:
         """Return the levels less those that noise forbids, correlated as it has turned out."""
@@ -188,8 +187,9 @@ class Engine:
         return [*levels[: index + 1], min(finest, levels[index])]
 
     def _solve(
-        self, level: Level, state: State, phase: str, index: int, levels: int, temperature: float,
-        believed: float, near: NDArray[np.float64], sure: NDArray[np.float64] | None, final: bool,
+        self, level: Level, state: State, lin: Linearisation, phase: str, index: int, levels: int,
+        temperature: float, believed: float, near: NDArray[np.float64],
+        sure: NDArray[np.float64] | None, final: bool,
     ) -> Outcome:  # fmt: skip
         rules = Rules(
             _scale(self.preset, phase),
@@ -209,7 +209,7 @@ class Engine:
             self.callback(self.history[-1])
 
         return solve_level(
-            level.problem, level.grid, state, level.loss, rules, self.acting, temperature,
+            level.problem, level.grid, state, lin, level.loss, rules, self.acting, temperature,
             self.free, level.smooth, self.workers, report, near, sure,
             lambda: self.clock.over,
         )  # fmt: skip

@@ -44,7 +44,7 @@ class Rules:
     believed: float = 1.0
     """Factor of the poses' variance over what independent residuals would leave: it scales the
     standard deviations above."""
-    tolerance: float = 1e-2
+    tolerance: float = 3e-2
     """Relative residual of the reduced system at which an iterative step is good enough."""
     outer: int = 12
     """Most products with the exact reduced matrix in one step."""
@@ -97,6 +97,7 @@ def solve_level(
     problem: Problem,
     grid: Grid,
     state: State,
+    lin: Linearisation,
     loss: Loss,
     rules: Rules,
     prior: PosePrior,
@@ -115,6 +116,7 @@ def solve_level(
         problem: the points.
         grid: where the nodes stand.
         state: where to start.
+        lin: the linearisation there, at whatever robust scale; its arrays are overwritten.
         loss: the residual; its robust scale is set here as the residuals fall.
         rules: how to iterate.
         prior: the measured poses.
@@ -128,12 +130,10 @@ def solve_level(
         sure: (6N, 6N) what of it is not noise in the map's slope; None: all of it.
         over: asked before each iteration but the first whether to end.
     """
-    lin = linearise(problem, grid, state, replace(loss, robust_c=0.0), workers, smooth)
     sigma = robust_sigma(lin.residuals)
     loss = judge = _rescaled(loss, rules, sigma)
+    lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
     spare = None
-    if rules.robust:
-        lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
     damping, converged = 0.0, False
     dof = 6 * max(int(free.sum()), 1)
     # a direction that goes back to its measured pose gives up what it had gained from noise

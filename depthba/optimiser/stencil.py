@@ -25,6 +25,8 @@ Field = NDArray[np.float64]
 
 # Relative residual down to which single precision is enough.
 SINGLE = 1e-5
+# Nodes below which threads wait for each other longer than they work.
+FEW = 400_000
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,9 @@ class MapSolver:
         dtype = np.float32 if tolerance >= SINGLE else np.float64
         self._couplings = np.zeros((4, ny + 2, nx + 2), dtype)
         self._workers = workers
-        self._bands = [(0, ny)] if workers is None else workers.bands(ny)
+        self._bands = [(0, ny)]
+        if workers is not None and ny * nx >= FEW:
+            self._bands = workers.bands(ny)
         self._map(lambda *band: _reciprocal_root(C.own, self._scale, *band))
         fields = C.right, C.up, C.up_right, C.up_left
         self._map(lambda *band: _scaled(self._scale, *fields, self._couplings, *band))
@@ -264,6 +268,36 @@ def _next_row(r, beta, p, y, out):
         out[x + 1] = r[y, x] + beta * p[y + 1, x + 1]
 
 
+# The product with a row goes in two: of more arrays at once the compiler does not prove that they
+# lie apart, and gives up on vector instructions.
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _straight(right, up, up_below, here, above, below, q):
+    for x in range(q.shape[0]):
+        q[x] = (
+            here[x + 1]
+            + right[x + 1] * here[x + 2]
+            + right[x] * here[x]
+            + up[x + 1] * above[x + 1]
+            + up_below[x + 1] * below[x + 1]
+        )
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _across(across, across_below, back, back_below, here, above, below, q):
+    """Add the diagonal neighbours to ``q``; return ``here . q``."""
+    total = q.dtype.type(0.0)
+    for x in range(q.shape[0]):
+        v = q[x] + (
+            across[x + 1] * above[x + 2]
+            + across_below[x] * below[x]
+            + back[x] * above[x]
+            + back_below[x + 1] * below[x + 2]
+        )
+        q[x] = v
+        total += v * here[x + 1]
+    return total
+
+
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
     """Take the next direction ``after = r + beta p`` and ``q``, its product with the matrix.
@@ -274,6 +308,7 @@ def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
     """
     h, w = r.shape
     beta = r.dtype.type(beta)
+    end = x0 + w + 2
     ghosts = np.zeros((2, w + 2), r.dtype)
     if first > 0:
         _next_row(r, beta, p, first - 1, ghosts[0])
@@ -286,26 +321,15 @@ def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
         below = ghosts[0] if y == first else after[y]
         here = after[y + 1]
         above = ghosts[1] if y + 1 == last else after[y + 2]
-        right, right_below = couplings[0, y0 + y + 1], couplings[0, y0 + y + 1]
-        up, up_below = couplings[1, y0 + y + 1], couplings[1, y0 + y]
-        across, across_below = couplings[2, y0 + y + 1], couplings[2, y0 + y]
-        back, back_below = couplings[3, y0 + y + 1], couplings[3, y0 + y]
-        total = r.dtype.type(0.0)
-        for x in range(w):
-            c = x + x0
-            v = (
-                here[x + 1]
-                + right[c + 1] * here[x + 2]
-                + right_below[c] * here[x]
-                + up[c + 1] * above[x + 1]
-                + up_below[c + 1] * below[x + 1]
-                + across[c + 1] * above[x + 2]
-                + across_below[c] * below[x]
-                + back[c] * above[x]
-                + back_below[c + 1] * below[x + 2]
-            )
-            q[y, x] = v
-            total += v * here[x + 1]
+        at, under = y0 + y + 1, y0 + y
+        _straight(
+            couplings[0, at, x0:end], couplings[1, at, x0:end], couplings[1, under, x0:end],
+            here, above, below, q[y],
+        )  # fmt: skip
+        total = _across(
+            couplings[2, at, x0:end], couplings[2, under, x0:end], couplings[3, at, x0:end],
+            couplings[3, under, x0:end], here, above, below, q[y],
+        )  # fmt: skip
         sums[y] = total
 
 
