@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, eigh
+from scipy.linalg import eigh
 
 from depthba.optimiser import coupling, probes, reduced
 from depthba.optimiser.feet import Ground
@@ -91,7 +91,7 @@ def correlation(
     if not keep.any():
         return Correlation(1.0, S, 0.0, np.zeros((1, len(S))))
     inner = S[np.ix_(keep, keep)]
-    P = block_diag(*prior.normal_equations(state.T_map_camera, lin.pivots)[0])[np.ix_(keep, keep)]
+    P = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
     rng = np.random.default_rng(0)
     random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
@@ -218,8 +218,8 @@ def assess(
     keep = np.repeat(free, 6)
     J = about_pivot(state.T_map_camera, lin.pivots)
     data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
-    held = block_diag(*np.einsum("nji,njk,nkl->nil", J, prior.information, J))[np.ix_(keep, keep)]
-    posterior = np.linalg.inv(data + held)
+    held = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
+    posterior = np.asarray(np.linalg.inv(data + held), float)
     if known is not None and keep.any():
         whole = known.S[np.ix_(keep, keep)]
         scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30) ** 2
@@ -261,9 +261,10 @@ def _weak_directions(
     alike.
     """
     weak = []
+    measured = np.linalg.inv(held)
     for k, i in enumerate(np.flatnonzero(free)):
         window = slice(6 * k, 6 * k + 6)
-        believed = np.linalg.inv(held[window, window])
+        believed = measured[window, window]
         values, duals = eigh(posterior[window, window], believed)
         lever = problem.frames[i].extent
         for value, dual in zip(values[::-1], duals.T[::-1], strict=True):

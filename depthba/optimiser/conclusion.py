@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from depthba import se3
 from depthba.optimiser import certainty
@@ -61,7 +60,7 @@ def conclude(
     firm, firm_lin, known = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
     variance = known.inflation * sigma**2
-    held_by_prior = block_diag(*prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0])
+    held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
     S, _ = without_slope_noise(
         firm, level.grid, state, outcome.loss, firm_lin, known.S, variance * held_by_prior,
         engine.free, workers, sigma,

@@ -59,7 +59,7 @@ def solve(
     Args:
         lin: the normal equations.
         free: (N,) frames that move.
-        prior: (N, 6, 6) and (N, 6), matrix and gradient that the measured poses add.
+        prior: (6N, 6N) and (N, 6), matrix and gradient that the measured poses add.
         damping: Levenberg-Marquardt, relative to the diagonal of the reduced matrix.
         workers: the threads.
         tolerance: relative residual of the reduced system at which the iterative road ends.
@@ -83,9 +83,7 @@ def solve(
         return Step(steps, answer - back, length)
     g = g + prior[1]
     S = here.S if here is not None else near if near is not None else lumped(lin, workers)
-    extra = np.zeros_like(S)
-    for i in range(n):
-        extra[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = prior[0][i]
+    extra = prior[0]
     bound = (S + extra)[np.ix_(keep, keep)]
     # a frame without points, or a direction nothing holds, must not make the matrix singular
     floor = 1e-12 * np.max(np.diag(bound), initial=1e-300)
@@ -120,9 +118,7 @@ def solve(
 def _held_step(g, prior, S, sure, keep, damping):
     """Return the step (N, 6) that noise in the map's slope does not drive, and its length."""
     n = len(keep) // 6
-    extra = np.zeros_like(S)
-    for i in range(n):
-        extra[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = prior[0][i]
+    extra = prior[0]
     window = np.ix_(keep, keep)
     ridge = 1e-9 * np.diag(np.diag(S[window]) + np.max(np.diag(S[window]), initial=1e-300) * 1e-3)
     through = np.linalg.solve(S[window] + ridge, sure[window]).T

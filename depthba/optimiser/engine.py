@@ -8,7 +8,6 @@ from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from depthba.optimiser import certainty, reduced, schedule
 from depthba.optimiser.bends import without_bends
@@ -41,8 +40,12 @@ NEAR = 1e-2
 NOISY = 0.1
 # That share grows from a level to the next by less than this.
 FINER = 4.0
+# A spacing below this share of the last one is worth a level of its own.
+CLEARLY = 0.9
 # Times that the last level goes on when the residuals turn out less correlated than was thought.
-AGAIN = 2
+AGAIN = 4
+# It goes on when their inflation has come out below this share of what was believed.
+LESS = 0.8
 
 
 @dataclass(frozen=True)
@@ -122,49 +125,73 @@ class Engine:
         known: certainty.Correlation | None = None
         levels = list(levels)
         for index in count():
-            spacing = levels[index]
             last = index == len(levels) - 1 or self.clock.over
-            level = make_level(self.problem, poses, spacing, self.preset, self.options, last)
-            heights = level_heights(
-                level, before.heights if before else None, before.grid if before else None
-            )
-            state, lin = solve_map(
-                level.problem, level.grid, State(poses, heights), level.loss, level.smooth,
-                self.workers, 1, NEAR,
-            )  # fmt: skip
+            level, state, lin = self._lay(levels[index], poses, before, last)
             for phase in phases(1 if refining else index, self.preset):
                 near = reduced.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
-                temperature = believed * robust_sigma(lin.residuals) ** 2 if known else 0.0
-                sure = self._sure(level, state, lin, near.S, temperature)
                 final = last and phase == phases(1, self.preset)[-1]
-                outcome = self._solve(
-                    level, state, lin, phase, index, len(levels), temperature, believed, near.S,
-                    sure, final,
-                )  # fmt: skip
+                temperature, outcome = self._descend(
+                    level, state, lin, near, phase, index, len(levels), known, final
+                )
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
                 break
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
             if known and self.options.resolution is None:
-                levels = self._no_finer(levels, index, np.sqrt(known.inflation) * outcome.sigma)
+                levels, known = self._no_finer(levels, index, level, outcome, known)
         if not judged:
             return End(level, outcome, temperature)
         for _ in range(AGAIN):
             there = self.known_at(level, outcome.state, outcome.loss)
-            inflation = there.correlation.inflation
-            if not outcome.converged or inflation > 0.5 * believed:
+            known = there.correlation
+            finer = self._finer(level.grid.spacing, known, outcome)
+            less = known.inflation < LESS * believed
+            if not outcome.converged or not (less or finer < level.grid.spacing):
                 return End(level, outcome, temperature, there)
-            believed = inflation
-            outcome = self._solve(
-                level, outcome.state, outcome.lin, phase, index, len(levels), temperature,
-                believed, near.S, sure, True,
-            )  # fmt: skip
+            # poses that had not settled had made the residuals look more alike than they are
+            believed, state, lin = known.inflation, outcome.state, outcome.lin
+            if finer < level.grid.spacing:
+                index += 1
+                level, state, lin = self._lay(
+                    finer, state.T_map_camera, Map(state.heights, level.grid), True
+                )
+            near = reduced.reduce(lin, self.workers, NEAR, self.free)
+            temperature, outcome = self._descend(
+                level, state, lin, near, phase, index, index + 1, known, True
+            )
             self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature)
+
+    def _lay(
+        self, spacing: float, poses: NDArray[np.float64], before: Map | None, last: bool
+    ) -> tuple[Level, State, Linearisation]:
+        """Return a level, and its map solved for the poses."""
+        level = make_level(self.problem, poses, spacing, self.preset, self.options, last)
+        heights = level_heights(
+            level, before.heights if before else None, before.grid if before else None
+        )
+        state, lin = solve_map(
+            level.problem, level.grid, State(poses, heights), level.loss, level.smooth,
+            self.workers, 1, NEAR,
+        )  # fmt: skip
+        return level, state, lin
+
+    def _descend(
+        self, level: Level, state: State, lin: Linearisation, near: reduced.Reduction, phase: str,
+        index: int, levels: int, known: certainty.Correlation | None, final: bool,
+    ) -> tuple[float, Outcome]:  # fmt: skip
+        """Weigh the measured poses by what is known, and solve; return their weight too."""
+        believed = known.inflation if known else 1.0
+        temperature = believed * robust_sigma(lin.residuals) ** 2 if known else 0.0
+        sure = self._sure(level, state, lin, near.S, temperature)
+        outcome = self._solve(
+            level, state, lin, phase, index, levels, temperature, believed, near.S, sure, final
+        )
+        return temperature, outcome
 
     def known_at(self, level: Level, state: State, loss: Loss) -> Known:
         """Return what the points say at a state, but for those that must not vouch for it."""
@@ -179,12 +206,31 @@ class Engine:
         self.clock.lap("certainty")
         return Known(problem, lin, found)
 
-    def _no_finer(self, levels: list[float], index: int, deviation: float) -> list[float]:
+    def _no_finer(
+        self, levels: list[float], index: int, level: Level, outcome: Outcome,
+        known: certainty.Correlation,
+    ) -> tuple[list[float], certainty.Correlation]:  # fmt: skip
         """Return the levels less those that noise forbids, correlated as it has turned out."""
-        finest = schedule.finest_spacing(self.problem, deviation)
+        finest = self._finest(known, outcome)
         if levels[index + 1] >= finest:
-            return levels
-        return [*levels[: index + 1], min(finest, levels[index])]
+            return levels, known
+        # what was found out before the poses had settled is not the last word
+        near = reduced.reduce(outcome.lin, self.workers, NEAR, self.free)
+        known = self._correlation(level, outcome.state, outcome.lin, near)
+        finest = self._finest(known, outcome)
+        if levels[index + 1] >= finest:
+            return levels, known
+        return [*levels[: index + 1], min(finest, levels[index])], known
+
+    def _finest(self, known: certainty.Correlation, outcome: Outcome) -> float:
+        return schedule.finest_spacing(self.problem, np.sqrt(known.inflation) * outcome.sigma)
+
+    def _finer(self, spacing: float, known: certainty.Correlation, outcome: Outcome) -> float:
+        """Return a spacing that noise allows if it is clearly finer, no less than half; or it."""
+        if self.options.resolution is not None or self.preset.whole:
+            return spacing
+        finest = max(self._finest(known, outcome), spacing / 2)
+        return finest if finest < CLEARLY * spacing else spacing
 
     def _solve(
         self, level: Level, state: State, lin: Linearisation, phase: str, index: int, levels: int,
@@ -223,7 +269,7 @@ class Engine:
             return None
         matrix, _ = self.prior.normal_equations(state.T_map_camera, lin.pivots)
         less, self.noisy = without_slope_noise(
-            level.problem, level.grid, state, level.loss, lin, S, temperature * block_diag(*matrix),
+            level.problem, level.grid, state, level.loss, lin, S, temperature * matrix,
             self.free, self.workers, share=NOISY,
         )  # fmt: skip
         return None if less is S else less

@@ -6,39 +6,87 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from depthba import se3
+
+# Rounds in which the gauge is found: it is next to linear.
+ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class PosePrior:
     """Gaussian priors on the poses.
 
-    The error is ``[t - t_measured, log(R R_measured^T)]``, map axes.
+    The error of a pose is ``[t - t_measured, log(R R_measured^T)]``, map axes. The map hangs on
+    frame 0 as it was measured, whose own error all other frames share: a degree in frame 0 shifts a
+    frame five metres away by nine centimetres. So the errors are taken after the rigid motion, the
+    *gauge*, that makes the cost least; it pays as frame 0's error.
     """
 
     T_map_camera: NDArray[np.float64]
     """(N, 4, 4), measured."""
     information: NDArray[np.float64]
-    """(N, 6, 6), inverse covariance; zero where nothing is believed."""
+    """(N, 6, 6), inverse covariance; zero where nothing is believed, and of frames that do not
+    move."""
+    gauge: NDArray[np.float64] | None = None
+    """(6, 6), inverse covariance of frame 0's own error; None: it has none."""
 
     def cost(self, T_map_camera: NDArray[np.float64]) -> float:
-        """Return the sum of squared normalised errors."""
-        e = se3.difference(T_map_camera, self.T_map_camera)
-        return float(np.einsum("ni,nij,nj->", e, self.information, e))
+        """Return the sum of squared normalised errors, the gauge's own included."""
+        e, _, _, paid = self._errors(T_map_camera)
+        return paid + float(np.einsum("ni,nij,nj->", e, self.information, e))
 
     def normal_equations(
         self, T_map_camera: NDArray[np.float64], pivots: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the matrix (N, 6, 6) and gradient (N, 6) in perturbations about the pivots (N, 3).
+        """Return the matrix (6N, 6N) and gradient (N, 6) in perturbations about the pivots (N, 3).
 
-        The derivative of the rotation's logarithm is taken as the identity: its error is of second
-        order in an angle that is small wherever the prior matters.
+        The gauge is eliminated. The derivative of the rotation's logarithm is taken as the
+        identity: its error is of second order in an angle that is small wherever the prior matters.
         """
-        J = about_pivot(T_map_camera, pivots)
-        e = se3.difference(T_map_camera, self.T_map_camera)
+        e, turn, K, _ = self._errors(T_map_camera)
+        J = np.kron(np.eye(2), turn) @ about_pivot(T_map_camera, pivots)
         weighted = np.einsum("nji,njk->nik", J, self.information)
-        return weighted @ J, np.einsum("nij,nj->ni", weighted, e)
+        matrix = block_diag(*(weighted @ J))
+        if self.gauge is not None and self.information.any():
+            U = (weighted @ K).reshape(-1, 6)
+            matrix -= U @ self._inverse(K) @ U.T
+        return matrix, np.einsum("nij,nj->ni", weighted, e)
+
+    def _errors(
+        self, T_map_camera: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+        """Return the errors (N, 6), the gauge's rotation, its Jacobians (N, 6, 6) and its cost."""
+        centre = self.T_map_camera[:1, :3, 3]
+        G = np.eye(4)[None]
+        K = about_pivot(T_map_camera, centre)
+        if self.gauge is None or not self.information.any():
+            return se3.difference(T_map_camera, self.T_map_camera), np.eye(3), K, 0.0
+        for _ in range(ROUNDS):
+            moved, own = self._moved(T_map_camera, G)
+            K = about_pivot(moved, centre + own[:3])
+            e = se3.difference(moved, self.T_map_camera)
+            b = self.gauge @ own + np.einsum("nji,njk,nk->i", K, self.information, e)
+            G = move(G, centre + own[:3], -(self._inverse(K) @ b)[None])
+        moved, own = self._moved(T_map_camera, G)
+        e = se3.difference(moved, self.T_map_camera)
+        return e, G[0, :3, :3], K, float(own @ self.gauge @ own)
+
+    def _moved(
+        self, T_map_camera: NDArray[np.float64], G: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the poses under the gauge (1, 4, 4), and what it does to frame 0 (6,)."""
+        first = self.T_map_camera[:1]
+        return G @ T_map_camera, se3.difference(G @ first, first)[0]
+
+    def _inverse(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the inverse (6, 6) of what holds the gauge."""
+        H = self.gauge + np.einsum("nji,njk,nkl->il", K, self.information, K)
+        own = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        return np.asarray(np.linalg.pinv(H * np.outer(own, own), hermitian=True)) * np.outer(
+            own, own
+        )
 
 
 def pose_prior(
@@ -48,7 +96,7 @@ def pose_prior(
     sigma_r: NDArray[np.float64],
     fixed: NDArray[np.bool_],
 ) -> PosePrior:
-    """Build a prior from standard deviations along the world axes.
+    """Build a prior from standard deviations along the world axes, frame 0's among them.
 
     Args:
         T_map_camera: (N, 4, 4) measured.
@@ -62,7 +110,7 @@ def pose_prior(
     one[3:, 3:] = R_map_world @ np.diag(1.0 / np.square(sigma_r)) @ R_map_world.T
     information = np.repeat(one[None], len(T_map_camera), axis=0)
     information[fixed] = 0.0
-    return PosePrior(T_map_camera, information)
+    return PosePrior(T_map_camera, information, one)
 
 
 def about_pivot(

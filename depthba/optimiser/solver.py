@@ -24,6 +24,10 @@ from depthba.optimiser.workers import Workers
 
 # Factor by which steps are taken to shrink before two of them say more.
 PACE = 0.5
+# Times that the map is solved anew at the poses of a step before it is turned down.
+FOLLOW = 2
+# Tolerance of those solves.
+ROUGHLY = 1e-2
 
 
 @dataclass(frozen=True)
@@ -157,13 +161,22 @@ def solve_level(
         )
         after = linearise(problem, grid, candidate, loss, workers, smooth, judge, spare)
         before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
-        after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
         # steps that shrink by the same factor leave a geometric series to go
         left = length * pace / (1 - pace)
         deviation = np.sqrt(dof * max(rules.believed * sigma**2, 1e-30))
         small = left < rules.settled * deviation
         # with the nodal gradient the cost may rise in the last digits while the poses still settle
-        accepted = after_cost <= before_cost * (1 + (1e-3 if small else 1e-6)) + unlearnt
+        most = before_cost * (1 + (1e-3 if small else 1e-6)) + unlearnt
+        after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+        for _ in range(FOLLOW):
+            if after_cost <= most:
+                break
+            # where frames and map shift together, heights at edges do not follow in proportion
+            candidate, after = _map_followed(
+                problem, grid, candidate, after, loss, smooth, workers, judge
+            )
+            after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+        accepted = after_cost <= most
         if accepted:
             pace = min(max(0.5 * (pace + length / previous), 0.1), 0.9)
             previous = length
@@ -186,6 +199,22 @@ def solve_level(
         if damping > 1e6:
             break
     return Outcome(state, lin, loss, converged, sigma)
+
+
+def _map_followed(
+    problem: Problem,
+    grid: Grid,
+    state: State,
+    lin: Linearisation,
+    loss: Loss,
+    smooth: NDArray[np.bool_],
+    workers: Workers,
+    judge: Loss,
+) -> tuple[State, Linearisation]:
+    """Take a step of the heights alone; the arrays of ``lin`` are overwritten."""
+    answer, _ = MapSolver(lin.C, ROUGHLY, workers).solve(-lin.g_map, ROUGHLY)
+    state = replace(state, heights=state.heights + answer)
+    return state, linearise(problem, grid, state, loss, workers, smooth, judge, lin)
 
 
 def _rescaled(loss: Loss, rules: Rules, sigma: float) -> Loss:

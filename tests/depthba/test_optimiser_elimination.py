@@ -77,17 +77,15 @@ def test_step_agrees_with_dense(lin: Linearisation, damping: float) -> None:
     """Damping scales the diagonal of the lumped matrix of the poses, priors included."""
     n, rng = len(lin.A), np.random.default_rng(3)
     free = np.array([False, *[True] * (n - 1)])
-    root = rng.standard_normal((n, 6, 6))
-    prior = 5 * np.einsum("nij,nkj->nik", root, root), rng.standard_normal((n, 6))
+    root = rng.standard_normal((6 * n, 6 * n))
+    prior = root @ root.T, rng.standard_normal((n, 6))
     workers = Workers(1)
     step = eliminate.solve(lin, free, prior, damping, workers, 1e-10, 200)
     H, g = dense_of(lin)
     bound = reduced.lumped(lin, workers)
-    for i in range(n):
-        window = slice(6 * i, 6 * i + 6)
-        H[window, window] += prior[0][i]
-        bound[window, window] += prior[0][i]
-        g[window] += prior[1][i]
+    H[: 6 * n, : 6 * n] += prior[0]
+    bound += prior[0]
+    g[: 6 * n] += prior[1].ravel()
     undamped = H.copy()
     H[range(6 * n), range(6 * n)] += damping * np.diag(bound)
     keep = np.concatenate([np.repeat(free, 6), np.ones(lin.g_map.size, bool)])
@@ -106,7 +104,7 @@ def test_lumped_step_descends_less_far_but_downhill(lin: Linearisation) -> None:
     """Without the correction the step is the bound's own: short where S is weak, never uphill."""
     n = len(lin.A)
     free = np.array([False, *[True] * (n - 1)])
-    nothing = np.zeros((n, 6, 6)), np.zeros((n, 6))
+    nothing = np.zeros((6 * n, 6 * n)), np.zeros((n, 6))
     workers = Workers(1)
     H, g = dense_of(lin)
 
@@ -126,7 +124,7 @@ def test_frame_that_nothing_holds_does_not_break_the_step() -> None:
     state = replace(case.state, T_map_camera=far)
     lin = linearise(case.problem, case.grid, state, RANGE, Workers(1), case.smooth)
     assert not lin.A[2].any()
-    nothing = np.zeros((4, 6, 6)), np.zeros((4, 6))
+    nothing = np.zeros((24, 24)), np.zeros((4, 6))
     free = np.array([False, True, True, True])
     step = eliminate.solve(lin, free, nothing, 0.0, Workers(1), 1e-2, 12)
     assert np.isfinite(step.pose).all() and np.isfinite(step.map).all()

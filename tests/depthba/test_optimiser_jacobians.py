@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from depthba import se3
 from depthba.optimiser.grid import Grid
@@ -183,17 +184,34 @@ def test_prior_normal_equations(isotropic: bool) -> None:
     # the logarithm's derivative is taken as the identity, which isotropic rotations do not notice
     scale = np.abs(gradient).max()
     np.testing.assert_allclose(gradient, numeric, atol=(1e-6 if isotropic else 5e-3) * scale)
-    assert not gradient[0].any() and not matrix[0].any()
+    assert not gradient[0].any() and not matrix[:6].any()
 
-    def slope(delta: Floats) -> Floats:
-        moved = move(measured, pivots, np.tile(delta, (5, 1)))
-        # about the pivots that moved along: what is differentiated is the gradient's camera part
-        return prior.normal_equations(moved, moved[:, :3, 3])[1]
 
-    at_measured = prior.normal_equations(measured, pivots)[0]
-    J = about_pivot(measured, pivots)
-    numeric = np.einsum("nji,njk->nik", J, derivative(slope, 1e-6))
-    np.testing.assert_allclose(at_measured, numeric, atol=1e-5 * np.abs(at_measured).max())
+def test_prior_knows_what_the_frames_share() -> None:
+    """At the measured poses its inverse is the covariance of the poses relative to frame 0.
+
+    Each frame's own, and frame 0's carried to it: a shift, and a turn about frame 0.
+    """
+    measured, _, prior = some_prior(False)
+    assert prior.gauge is not None
+    carried = about_pivot(measured, measured[:1, :3, 3])[1:].reshape(-1, 6)
+    want = block_diag(*np.linalg.inv(prior.information[1:]))
+    want = want + carried @ np.linalg.inv(prior.gauge) @ carried.T
+    about_centres = prior.normal_equations(measured, measured[:, :3, 3])[0][6:, 6:]
+    np.testing.assert_allclose(
+        np.linalg.inv(about_centres), want, rtol=1e-6, atol=1e-9 * np.abs(want).max()
+    )
+
+
+def test_prior_lets_frame_0_pay_for_what_all_frames_share() -> None:
+    measured, _, prior = some_prior(True)
+    slip = np.array([[0.004, -0.003, 0.002, 0.01, 0.02, -0.015]])
+    turned = move(measured, np.repeat(measured[:1, :3, 3], 5, axis=0), np.repeat(slip, 5, axis=0))
+    turned[0] = measured[0]
+    assert prior.gauge is not None
+    alone = float(slip[0] @ prior.gauge @ slip[0])
+    assert 0.5 * alone < prior.cost(turned) <= alone * (1 + 1e-9)
+    assert replace(prior, gauge=None).cost(turned) > 3 * alone
 
 
 def test_prior_is_in_world_axes() -> None:
@@ -203,7 +221,8 @@ def test_prior_is_in_world_axes() -> None:
         delta = np.zeros((5, 6))
         delta[:, 3 * (k // 3) : 3 * (k // 3) + 3] = 3 * sigma * R_map_world[:, k % 3]
         # frame 0 has none
-        assert prior.cost(se3.retract(measured, delta)) == pytest.approx(4 * 9, rel=1e-6)
+        alone = replace(prior, gauge=None)
+        assert alone.cost(se3.retract(measured, delta)) == pytest.approx(4 * 9, rel=1e-6)
 
 
 def test_move_is_about_the_pivot() -> None:

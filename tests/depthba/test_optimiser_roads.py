@@ -84,7 +84,7 @@ def test_both_roads_lead_to_the_same_step(lin: Linearisation) -> None:
     """The iterative road, preconditioned by a matrix of another place, against the direct one."""
     n, workers = len(lin.A), Workers(1)
     free = np.arange(n) > 0
-    nothing = np.repeat(np.eye(6)[None], n, axis=0), np.zeros((n, 6))
+    nothing = np.eye(6 * n), np.zeros((n, 6))
     here = reduced.reduce(lin, workers, 1e-8)
     elsewhere = reduced.reduce(lin, workers, 1e-2).S + 0.1 * np.diag(np.diag(here.S))
     direct = eliminate.solve(lin, free, nothing, 0.0, workers, 1e-9, 0, here=here)
@@ -97,7 +97,7 @@ def test_both_roads_lead_to_the_same_step(lin: Linearisation) -> None:
 def test_step_without_noise_in_it_is_the_plain_one(lin: Linearisation) -> None:
     n, workers = len(lin.A), Workers(1)
     free = np.arange(n) > 0
-    prior = np.repeat(np.eye(6)[None], n, axis=0), np.full((n, 6), 0.1)
+    prior = np.eye(6 * n), np.full((n, 6), 0.1)
     here = reduced.reduce(lin, workers, 1e-8)
     plain = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, here=here)
     sure = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=here.S)
