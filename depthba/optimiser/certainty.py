@@ -56,7 +56,9 @@ class Correlation:
     """How much less the points know than as many independent ones would."""
 
     inflation: float
-    """Factor on the variance of the poses, at least 1."""
+    """Factor on the variance of the poses, at least 1, where the data hold them least."""
+    overall: float
+    """The same over all directions alike."""
     S: NDArray[np.float64]
     """(6N, 6N), exact reduced matrix that it was measured with."""
     owed: float
@@ -83,13 +85,14 @@ def correlation(
     groups of points say what independent residuals would give. Each gives a scatter of the
     estimate, ``V G V`` with ``V = (S + T P)^-1``; the factor is the ratio of the two in units of
     the prior P, so that the directions count that the data hold least. The prior's weight T depends
-    on the factor in turn, which a few rounds settle.
+    on the factor in turn, which a few rounds settle. In units of what the data say, S, all
+    directions count alike: the second factor.
     """
     reduction = reduction or reduced.reduce(lin, workers)
     S = reduction.S
     keep = np.repeat(free, 6)
     if not keep.any():
-        return Correlation(1.0, S, 0.0, np.zeros((1, len(S))))
+        return Correlation(1.0, 1.0, S, 0.0, np.zeros((1, len(S))))
     inner = S[np.ix_(keep, keep)]
     P = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
@@ -104,11 +107,14 @@ def correlation(
         V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, spread[0] / max(spread[1], 1e-300))
+    V = np.linalg.inv(inner + max(variance, 1e-30) * P)
+    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in scores]
+    overall = max(1.0, alike[0] / max(alike[1], 1e-300))
     T = max(factor * variance, 1e-30)
     owed = float(eigh(T * P, inner + T * P, eigvals_only=True)[-1])
     whole = np.zeros((count, len(S)))
     whole[:, keep] = scores[0]
-    return Correlation(factor, S, owed, whole)
+    return Correlation(factor, overall, S, owed, whole)
 
 
 def beyond_scalar(

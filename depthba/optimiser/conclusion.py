@@ -59,15 +59,15 @@ def conclude(
     found = found or engine.known_at(level, state, outcome.loss)
     firm, firm_lin, known = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
-    variance = known.inflation * sigma**2
+    variance, inflation = known.inflation * sigma**2, max(known.inflation, known.overall)
     held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
     S, _ = without_slope_noise(
         firm, level.grid, state, outcome.loss, firm_lin, known.S, variance * held_by_prior,
         engine.free, workers, sigma,
     )  # fmt: skip
     judged = certainty.assess(
-        level.problem, state, firm_lin, S, variance, prior, engine.preset.prior, engine.free, ids,
-        known,
+        level.problem, state, firm_lin, S, inflation * sigma**2, prior, engine.preset.prior,
+        engine.free, ids, known,
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
@@ -84,7 +84,7 @@ def conclude(
         depth_map_start=depth_map(problem, level, began, began_lin, sigma),
         covariance=judged.covariance,
         sigma=sigma,
-        inflation=known.inflation,
+        inflation=inflation,
         history=tuple(engine.history),
         weak=judged.weak,
         frames=frames,
