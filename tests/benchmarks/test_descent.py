@@ -52,7 +52,7 @@ def test_descent(benchmark: BenchmarkFixture) -> None:
         return float(np.median(apart)) / unit
 
     stages = {name: s / unit for name, s in result.seconds.items() if name.startswith("level")}
-    finest = max(ticks[-1][1].level, 0)
+    finest = ticks[-1][1].level
     to_fine = sum(s for name, s in stages.items() if not name.startswith(f"level {finest}"))
     found = {
         "an iteration at 5 cm": iteration(0.05),
