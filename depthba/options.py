@@ -28,6 +28,9 @@ class Options:
     """Threads of the kernels. None: all cores."""
     smoothing: float | None = None
     """Weight of the smoothing term against one point. None: the preset's own."""
+    priors: bool = True
+    """Take the measured poses as measurements, too. Off: they are only where to start (paper: always
+    off)."""
     prior_t: float | None = None
     """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.01
     (paper: no prior)."""

@@ -99,7 +99,7 @@ class Engine:
     @property
     def preset(self) -> schedule.Preset:
         """What the options' preset fixes."""
-        return schedule.PRESETS[self.options.preset]
+        return schedule.preset_of(self.options)
 
     @property
     def acting(self) -> PosePrior:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,12 @@ PRESETS = {
         smoothing=1e-4, relative=True, whole=False, prior=True,
     ),
 }  # fmt: skip
+
+
+def preset_of(options: Options) -> Preset:
+    """Return what the options' preset fixes."""
+    preset = PRESETS[options.preset]
+    return preset if options.priors else replace(preset, prior=False)
 
 
 def check(options: Options) -> None:
