@@ -29,8 +29,8 @@ class Options:
     smoothing: float | None = None
     """Weight of the smoothing term against one point. None: the preset's own."""
     priors: bool = True
-    """Take the measured poses as measurements, too. Off: they are only where to start (paper: always
-    off)."""
+    """Take the measured poses as measurements, too. Off: they are only where to start (the paper
+    preset never takes them)."""
     prior_t: float | None = None
     """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.01
     (paper: no prior)."""
