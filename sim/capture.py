@@ -75,7 +75,8 @@ class Capture:
 
 
 def sensor_of(entry: Scene, options: GenerateOptions) -> DepthSensor:
-    """The sensor in the size that the options ask for."""
+    """The sensor in the size and with the noise that the options ask for."""
     sensor = options.sensor or entry.sensor
     sensor = find_sensor(sensor) if isinstance(sensor, str) else sensor
+    sensor = sensor.noisier(options.depth_noise)
     return sensor if options.size is None else sensor.resized(*options.size)

@@ -27,6 +27,8 @@ class GenerateOptions:
     """Leave all noise out, of the depth and of the poses; start_error still counts."""
     pose_noise: float = 1.0
     """Factor on the rig's pose errors."""
+    depth_noise: float = 1.0
+    """Factor on the errors of the sensor's disparity: its sigma, steps and fixed pattern."""
     white: bool = False
     """For studies: the sensor's sigma along the ray, each pixel for itself, and no other fault."""
     without: tuple[str, ...] = ()
@@ -52,6 +54,10 @@ class GenerateOptions:
             raise OptionError(f"renderer {self.renderer!r}: expected rays or mujoco")
         if not (math.isfinite(self.pose_noise) and self.pose_noise >= 0.0):
             raise OptionError(f"pose_noise {self.pose_noise}: expected a factor of 0 or more")
+        if not (math.isfinite(self.depth_noise) and self.depth_noise > 0.0):
+            raise OptionError(
+                f"depth_noise {self.depth_noise}: expected a factor above 0 (clean leaves all out)"
+            )
 
 
 DEFAULTS = GenerateOptions()

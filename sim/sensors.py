@@ -74,6 +74,17 @@ class DepthSensor:
             flying=k * self.flying,
         )
 
+    def noisier(self, factor: float) -> DepthSensor:
+        """The same sensor with all errors of its disparity larger by a factor."""
+        if factor == 1.0:
+            return self
+        return replace(
+            self,
+            noise=replace(self.noise, sigma_m=factor * self.noise.sigma_m),
+            disparity_step=None if self.disparity_step is None else factor * self.disparity_step,
+            pattern=factor * self.pattern,
+        )
+
     @property
     def camera(self) -> Camera:
         """Its pinhole camera: square pixels, the principal point in the image's middle."""

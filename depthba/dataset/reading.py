@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +40,8 @@ class Dataset:
     frames: tuple[Frame, ...] = field(repr=False)
     warnings: tuple[str, ...] = ()
     """What was dropped while reading, one line each."""
+    left_out: frozenset[int] = frozenset()
+    """Ids of the frames in the folder that `subset` left out."""
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
@@ -110,6 +112,20 @@ class Dataset:
         """Return the frame at a position, which need not be its id."""
         return self.frames[index]
 
+    def subset(self, rows: Sequence[int]) -> Dataset:
+        """Return the dataset with the frames at these positions alone, in their order.
+
+        Raises `DatasetError` where there is no frame at a position.
+        """
+        for row in rows:
+            if not 0 <= row < len(self.frames):
+                raise DatasetError(
+                    f"{self.path}: no frame at position {row}, expected 0 to {len(self.frames) - 1}"
+                )
+        kept = tuple(self.frames[row] for row in sorted(set(rows)))
+        gone = {frame.id for frame in self.frames} - {frame.id for frame in kept}
+        return replace(self, frames=kept, left_out=self.left_out | gone)
+
     @property
     def ids(self) -> tuple[int, ...]:
         """The frames' ids."""
@@ -144,7 +160,11 @@ class Dataset:
 
     def markers(self) -> tuple[Marker, ...]:
         """Return the markers with known position; empty where there is no markers.json."""
-        return read_markers(self.path, self.ids, Faults(self.path))
+        found = read_markers(self.path, {*self.ids, *self.left_out}, Faults(self.path))
+        return tuple(
+            replace(m, observations=tuple(o for o in m.observations if o[0] not in self.left_out))
+            for m in found
+        )
 
     def calibration(self) -> dict[str, Any] | None:
         """Return calibration.json, checked, or None where there is none."""

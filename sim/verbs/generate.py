@@ -62,6 +62,8 @@ class Noise:
     """Draw what each stage does to frame 0, too: stages.png in the dataset's folder."""
     pose_noise: float = 1.0
     """Factor on the rig's pose errors."""
+    depth_noise: float = 1.0
+    """Factor on the errors of the sensor's disparity."""
     start_error: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="M RAD")] = None
     """Instead of the rig's pose errors: independent Gaussian errors per axis with these standard
     deviations, m and rad; frame 0 is exact."""
@@ -204,6 +206,7 @@ def options_of(arguments: Arguments) -> GenerateOptions:
         start_error=noise.start_error,
         clean=noise.clean,
         pose_noise=noise.pose_noise,
+        depth_noise=noise.depth_noise,
         white=noise.white,
         without=noise.without,
         sensor=capture.sensor,

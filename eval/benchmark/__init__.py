@@ -1,0 +1,1 @@
+"""Methods x datasets x seeds: run alike, judged alike, told in one report."""

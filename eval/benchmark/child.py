@@ -1,0 +1,98 @@
+"""Runs one method on one dataset in a process of its own: ``python -m eval.benchmark.child FOLDER``.
+
+``FOLDER/request.json`` says what to do; ``poses.txt`` and ``outcome.json`` are left there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import threading
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from depthba.dataset import Dataset
+from depthba.errors import DepthbaError, MissingPackage
+from depthba.trajectory import write_tum
+from eval.benchmark.judging import judge
+from eval.benchmark.outcome import POSES, Outcome
+from eval.benchmark.warming import warm
+from eval.methods import MethodError, Task, find_method
+
+REQUEST = "request.json"
+
+
+def main(folder: Path) -> None:
+    """Do what the request says; every end but a crash leaves an outcome."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    request = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
+    blank = Outcome.of_json(request["outcome"])
+    run(folder, request, blank).write(folder)
+
+
+def run(folder: Path, request: dict[str, Any], blank: Outcome) -> Outcome:
+    """Run the method and judge what it found."""
+    dataset = Dataset.open(request["dataset"])
+    if request["first"] is not None:
+        dataset = dataset.subset(range(min(request["first"], len(dataset))))
+    cache = Path(request["cache"])
+    cache.mkdir(parents=True, exist_ok=True)
+    task = Task.of(dataset, threads=request["threads"], cache=cache, say=_say)
+    try:
+        method = find_method(blank.method)
+        warm(method, task.threads)
+        found = method.run(task)
+        if not np.isfinite(found.T_world_camera).all():
+            raise MethodError("its poses are not finite")
+    except MissingPackage as error:
+        return replace(blank, status="missing", reason=_line(error))
+    except (MethodError, DepthbaError) as error:
+        return replace(blank, status="failed", reason=_line(error), memory=_most_memory())
+    except MemoryError:
+        return replace(blank, status="memory", reason="no memory left", memory=_most_memory())
+    except Exception as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        reason = f"{type(error).__name__}: {_line(error)} ({Path(at.filename).name}:{at.lineno})"
+        return replace(blank, status="crashed", reason=reason, memory=_most_memory())
+    memory = _most_memory()
+    stamps = np.array([frame.stamp for frame in dataset])
+    write_tum(folder / POSES, stamps, found.T_world_camera, blank.method)
+    return replace(
+        blank,
+        status="done",
+        seconds=dict(found.seconds),
+        memory=memory,
+        iterations=found.iterations,
+        notes=found.notes,
+        metrics=tuple(judge(task, found)),
+    )
+
+
+def _most_memory() -> float:
+    """Return the most memory that this process held so far, bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+
+
+def _end_with_parent() -> None:
+    """Whoever asked holds the other end of stdin: where it closes, nobody waits any more."""
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
