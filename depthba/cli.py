@@ -52,6 +52,12 @@ VERBS = {
     "evaluate": Verb(
         "eval.verbs.evaluate", "Measure runs against truth, or against themselves without it."
     ),
+    "benchmark": Verb(
+        "eval.verbs.benchmark",
+        "Run every method on every scene: the paper's tables and ours.",
+        extra="eval",
+        needs=("jinja2", "psutil"),
+    ),
     "review": Verb(
         "eval.verbs.review",
         "Open the recordings of runs in the viewer.",

@@ -1,6 +1,7 @@
-"""Runs one method on one dataset in a process of its own: ``python -m eval.benchmark.child FOLDER``.
+"""Runs one method on one dataset in a process of its own.
 
-``FOLDER/request.json`` says what to do; ``poses.txt`` and ``outcome.json`` are left there.
+``python -m eval.benchmark.child FOLDER``: ``FOLDER/request.json`` says what to do; ``poses.txt``
+and ``outcome.json`` are left there.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What one method did on one dataset, as its folder keeps it: ``poses.txt`` and ``outcome.json``."""
+"""What one method did on one dataset, as its folder keeps it."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import depthba
 from depthba.errors import OptionError
-from eval.methods import METHODS
+from eval.methods import METHODS, entry, in_order
 
 if TYPE_CHECKING:
     from sim.options import GenerateOptions
@@ -20,6 +20,11 @@ LABS = ("lab-1", "lab-2", "lab-3")
 BAYS = ("industrial-4", "industrial-5", "industrial-6")
 WIDTH = 320
 """Of the images, pixels, where none is asked for: a quarter of the sensors' own."""
+QUICK_SIZE = (160, 120)
+QUICK_FRAMES = 8
+QUICK_METHODS = (
+    "initial", "teaser", "teaser-icp", "balm2-fine", "gicp-pgo", "depthba-paper", "depthba",
+)  # fmt: skip
 STUDIES: dict[str, tuple[float, ...]] = {
     "start": (0.25, 0.5, 1.0, 2.0, 4.0, 8.0),
     "noise": (0.5, 1.0, 2.0, 4.0),
@@ -86,7 +91,7 @@ class Job:
 
 
 def methods_of(text: str | None) -> tuple[str, ...]:
-    """Return the methods named in ``A,B``, in the order of the tables; None: all.
+    """Return the methods named in ``A,B``, in the order of the tables; None: all of ours.
 
     Raises:
         OptionError: one is unknown.
@@ -96,11 +101,10 @@ def methods_of(text: str | None) -> tuple[str, ...]:
         return tuple(METHODS)
     asked = [name.strip() for name in text.split(",") if name.strip()]
     for name in asked:
-        if name not in METHODS:
-            raise OptionError(f"--methods {name}: unknown; choose from: {', '.join(METHODS)}")
+        entry(name)
     if not asked:
         raise OptionError(f"--methods {text!r}: names none; choose from: {', '.join(METHODS)}")
-    return tuple(name for name in METHODS if name in asked)
+    return tuple(in_order(asked))
 
 
 def given_cases(paths: Sequence[Path]) -> list[Case]:
@@ -159,18 +163,11 @@ def scene_cases(
     return cases
 
 
-def study_cases(study: str, scene: str, seeds: int, out: Path, most: int | None) -> list[Case]:
-    """Return the cases of a study: a scene at several values of one thing.
-
-    ``most`` limits how many values are taken, the middle one always among them.
-    """
-    values = STUDIES[study]
-    if most is not None and most < len(values):
-        values = tuple(values[round(k * (len(values) - 1) / (most - 1))] for k in range(most))
-    (base, *others) = scene_cases([scene], seeds, out, START)
+def study_cases(study: str, scene: str, seeds: int, out: Path) -> list[Case]:
+    """Return the cases of a study: a scene at several values of one thing."""
     cases = []
-    for value in values:
-        for case in (base, *others):
+    for value in STUDIES[study]:
+        for case in scene_cases([scene], seeds, out, START):
             made = _varied(case, study, value)
             name = f"{scene}-{study}-{value:g}-{case.seed}"
             path = case.path if made.options == case.options else out / "data" / name
@@ -202,6 +199,7 @@ def _varied(case: Case, study: str, value: float) -> Case:
     elif study == "overlap":
         options = replace(options, frames=int(value))
     elif study == "resolution":
+        assert options.size is not None
         width, height = options.size
         options = replace(options, size=(int(value), round(height * value / width)))
     return replace(case, options=options)

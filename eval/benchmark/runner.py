@@ -6,7 +6,6 @@ Dask cluster; what has an outcome is not run again.
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 from depthba import durable
 from depthba.errors import DepthbaError, OptionError

@@ -1,4 +1,4 @@
-"""A small registration before the one that is timed: what compiles or is imported once is not timed.
+"""A small registration before the one that is timed, so that compiling and importing are not.
 
 Three frames of waves with a few steps, seen from a metre, off by millimetres.
 """

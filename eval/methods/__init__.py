@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from depthba.errors import MissingPackage, OptionError
@@ -17,7 +18,9 @@ __all__ = [
     "MethodError",
     "Stopwatch",
     "Task",
+    "entry",
     "find_method",
+    "in_order",
     "missing",
 ]
 
@@ -60,9 +63,33 @@ METHODS: dict[str, Entry] = {
 """In the order of the tables."""
 
 
+def entry(name: str) -> Entry:
+    """Return what is known of a method: one of `METHODS`, or ``module:Class`` of one's own.
+
+    Raises:
+        OptionError: there is none of that name.
+
+    """
+    if name in METHODS:
+        return METHODS[name]
+    module, colon, kind = name.partition(":")
+    if not (colon and kind.isidentifier() and all(p.isidentifier() for p in module.split("."))):
+        choices = ", ".join(METHODS)
+        raise OptionError(
+            f"method {name!r}: unknown; choose from: {choices}, or name your own as module:Class"
+        )
+    return Entry(kind, module, kind)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of methods in the order of the tables, one's own last."""
+    there = dict.fromkeys(names)
+    return [n for n in METHODS if n in there] + [n for n in there if n not in METHODS]
+
+
 def missing(name: str) -> tuple[str, ...]:
     """Return the packages that a method needs and that are not installed."""
-    return tuple(p for p in METHODS[name].needs if importlib.util.find_spec(p) is None)
+    return tuple(p for p in entry(name).needs if importlib.util.find_spec(p) is None)
 
 
 def find_method(name: str) -> Method:
@@ -73,13 +100,14 @@ def find_method(name: str) -> Method:
         MissingPackage: a package that it needs is not installed.
 
     """
-    if name not in METHODS:
-        raise OptionError(f"method {name!r}: unknown; choose from: {', '.join(METHODS)}")
+    found = entry(name)
     if absent := missing(name):
         raise MissingPackage(
             f"method {name} needs {', '.join(absent)}, which is not installed: "
             "pip install 'depthba[eval]'"
         )
-    entry = METHODS[name]
-    method: Method = getattr(importlib.import_module(entry.module), entry.kind)()
+    try:
+        method: Method = getattr(importlib.import_module(found.module), found.kind)()
+    except (ImportError, AttributeError) as error:
+        raise OptionError(f"method {name!r}: cannot be loaded: {error}") from error
     return method
