@@ -34,6 +34,8 @@ ACROSS = 420
 """Pixels of an overview along its longer side."""
 DETAIL = 0.16
 """Side of a detail, as a share of the overview's longer side."""
+DENSE = 0.4
+"""Share of the densest places' points from which on the ground belongs to the overview."""
 FINER = 3
 """Pixels of a detail for one of the overview."""
 FRAMES = ("#e6194b", "#111111")
@@ -127,13 +129,19 @@ def of_jobs(
 
 
 def _view(clouds: Sequence[Floats], T: Floats, R_map_world: Floats) -> View:
-    points = np.concatenate(
-        [transform(U, p[:: max(1, len(p) // 4000)]) for U, p in zip(T, clouds, strict=True)]
-    )
-    points = points @ R_map_world.T
+    """Look at the ground that the frames are about: where points lie densest, with a margin."""
+    world = [transform(U, p) for U, p in zip(T, clouds, strict=True)]
+    points = np.concatenate([p[:: max(1, len(p) // 20000)] for p in world]) @ R_map_world.T
     low, high = np.quantile(points, [0.003, 0.997], axis=0)
-    pixel = float((high - low)[:2].max() / ACROSS)
-    return View(R_map_world, low[:2], high[:2], pixel, (float(low[2]), float(high[2])))
+    bins = [np.linspace(low[k], high[k], 65) for k in (0, 1)]
+    dense, *_ = np.histogram2d(points[:, 0], points[:, 1], bins)
+    x, y = np.nonzero(ndimage.median_filter(dense, 3) > DENSE * np.quantile(dense, 0.97))
+    corners = [[b[k.min()], b[k.max() + 1]] for b, k in zip(bins, (x, y), strict=True)]
+    box = np.array(corners) if len(x) else np.stack([low[:2], high[:2]], axis=1)
+    inside = ((points[:, :2] >= box[:, 0]) & (points[:, :2] <= box[:, 1])).all(axis=1)
+    heights = np.quantile(points[inside, 2], [0.01, 0.995])
+    pixel = float((box[:, 1] - box[:, 0]).max() / ACROSS)
+    return View(R_map_world, box[:, 0], box[:, 1], pixel, (float(heights[0]), float(heights[1])))
 
 
 def _aspect(view: View) -> float:
@@ -144,12 +152,13 @@ def _aspect(view: View) -> float:
 def _details(clouds: Sequence[Floats], T: Floats, view: View) -> list[View]:
     """Choose two windows full of edges that several frames see, apart from each other."""
     world = [transform(U, p) for U, p in zip(T, clouds, strict=True)]
-    heights, _ = _averaged(world, view)
+    heights, counts = _averaged(world, view)
+    dense = counts > DENSE * np.quantile(counts, 0.97)
     seen = np.zeros(heights.shape)
     for p in world:
         seen += np.isfinite(_averaged([p], view)[0])
     filled = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
-    steep = np.minimum(np.hypot(*np.gradient(filled)), 0.02) * (seen >= 2) * np.isfinite(heights)
+    steep = np.minimum(np.hypot(*np.gradient(filled)), 0.02) * (seen >= 2) * dense
     side = max(int(DETAIL * ACROSS), 8)
     score = ndimage.uniform_filter(steep, side, mode="constant")
     half = side // 2 + 1
@@ -162,7 +171,7 @@ def _details(clouds: Sequence[Floats], T: Floats, view: View) -> list[View]:
         y, x = y + half, x + half
         low = view.low + view.pixel * np.array([x - side / 2, y - side / 2])
         chosen.append(view.window(low, low + side * view.pixel, FINER))
-        score[max(y - 2 * side, 0) : y + 2 * side, max(x - 2 * side, 0) : x + 2 * side] = 0
+        score[max(y - side, 0) : y + side, max(x - side, 0) : x + side] = 0
     return chosen
 
 

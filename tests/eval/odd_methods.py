@@ -1,0 +1,65 @@
+"""Methods that end in every way that there is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from eval.methods import Estimate, MethodError, Task
+
+
+@dataclass(frozen=True)
+class Knows:
+    """Returns the truth, 1 mm along x off, in any world frame."""
+
+    def run(self, task: Task) -> Estimate:
+        T = task.dataset.T_world_camera_true.copy()
+        T[1:, 0, 3] += 0.001
+        elsewhere = np.eye(4)
+        elsewhere[:3, 3] = 5.0, 6.0, 7.0
+        return Estimate(elsewhere @ T, {"look": 1.0, "copy": 0.5}, iterations=3)
+
+
+@dataclass(frozen=True)
+class Refuses:
+    def run(self, task: Task) -> Estimate:
+        raise MethodError("frames 1 and 2 share nothing")
+
+
+@dataclass(frozen=True)
+class Raises:
+    def run(self, task: Task) -> Estimate:
+        return {}["nothing"]
+
+
+@dataclass(frozen=True)
+class Dies:
+    def run(self, task: Task) -> Estimate:
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError
+
+
+@dataclass(frozen=True)
+class Diverges:
+    def run(self, task: Task) -> Estimate:
+        return Estimate(np.full((len(task), 4, 4), np.nan), {})
+
+
+@dataclass(frozen=True)
+class Sleeps:
+    def run(self, task: Task) -> Estimate:
+        time.sleep(600)
+        raise AssertionError
+
+
+@dataclass(frozen=True)
+class Hoards:
+    def run(self, task: Task) -> Estimate:
+        kept = []
+        while True:
+            kept.append(np.ones(5_000_000))
+            time.sleep(0.02)
