@@ -2,7 +2,8 @@
 
 The resolution is the one that it chooses by itself; errors are mean absolute per axis. The peer is
 the GICP pose graph beside the checkout, at the voxel and the first correspondence distance of a
-sweep that are best on that dataset: a choice that only truth can make. `tests/benchmarks/sets.py` says how many sets and seeds are taken.
+sweep that are best on that dataset: a choice that only truth can make. `tests/benchmarks/sets.py`
+says how many sets and seeds are taken.
 """
 
 from __future__ import annotations
