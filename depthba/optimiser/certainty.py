@@ -108,13 +108,24 @@ def correlation(
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, spread[0] / max(spread[1], 1e-300))
     V = np.linalg.inv(inner + max(variance, 1e-30) * P)
-    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in scores]
+    both = _neighbours_mixed(scores[0]), scores[1]
+    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in both]
     overall = max(1.0, alike[0] / max(alike[1], 1e-300))
     T = max(factor * variance, 1e-30)
     owed = float(eigh(T * P, inner + T * P, eigvals_only=True)[-1])
     whole = np.zeros((count, len(S)))
     whole[:, keep] = scores[0]
     return Correlation(factor, overall, S, owed, whole)
+
+
+def _neighbours_mixed(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return scores (blocks, d) whose plain scatter is the given ones' with neighbours' products.
+
+    Products of blocks next to each other count by half, along both axes of the image (Bartlett's
+    kernel, which keeps the scatter positive).
+    """
+    columns, rows = (np.eye(n) + 0.5 * (np.eye(n, k=1) + np.eye(n, k=-1)) for n in BLOCKS)
+    return np.asarray(np.linalg.cholesky(np.kron(rows, columns)).T @ scores)
 
 
 def beyond_scalar(
