@@ -38,11 +38,11 @@ class GicpPgo:
     """Edge of the cubes that points are thinned to, m. None: `usual_voxel`."""
     reach: float | None = None
     """Partners in the first round are closer than this, m. None: `usual_reach`."""
-    rounds: int = 3
+    rounds: int = 4
     """At most; none follows the first whose reach was the least."""
     shrink: float = 3.0
     """By what the reach is divided from round to round."""
-    least_reach: float = 2.5
+    least_reach: float = 1.2
     """In voxels: partners may always be so far away."""
     least_overlap: float = LEAST
     """See `overlapping_pairs`."""

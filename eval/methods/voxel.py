@@ -8,7 +8,7 @@ from eval.methods.method import Task
 
 COARSEST = 4.0
 """In point spacings."""
-NOISE = 8.0
+NOISE = 6.0
 """In standard deviations of the range."""
 
 
@@ -16,7 +16,7 @@ def usual_voxel(task: Task) -> float:
     """Return the edge of the cubes that points are averaged in, m.
 
     A plane through the 20 nearest points leans at random where the noise of the range is a good
-    part of their distances. So points are eight standard deviations of the range apart, as the
+    part of their distances. So points are six standard deviations of the range apart, as the
     sensor is stated to have it at the median depth, but no finer than they were measured, and no
     more than four spacings, which would lose shape; that many where no noise is stated.
     """
