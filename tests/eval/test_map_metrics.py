@@ -83,7 +83,7 @@ def test_entropy_and_thickness_of_a_noisy_plane() -> None:
     """Points even in a disc of radius r: variance r^2 / 4 along it, the noise's across."""
     rng = np.random.default_rng(0)
     sigma, radius = 1e-3, 0.05
-    frames = [rng.uniform(-0.5, 0.5, (20_000, 3)) * [1, 1, 0] for _ in range(2)]
+    frames = [rng.uniform(-1, 1, (60_000, 3)) * [1, 1, 0] for _ in range(2)]
     frames = [p + rng.normal(size=p.shape) * [0, 0, sigma] for p in frames]
     tilt = np.stack([np.eye(4), se3.make(se3.exp_so3([0.3, 0.1, 0.2]), [1.0, 2.0, 3.0])])
     local = [(p - T[:3, 3]) @ T[:3, :3] for p, T in zip(frames, tilt, strict=True)]
@@ -154,8 +154,8 @@ SCENE = """
   <worldbody>
     <geom name="floor" type="box" size="2 2 0.1" pos="0 0 -0.1"/>
     <geom name="step" type="box" size="0.2 0.2 0.05" pos="0.3 0.1 0.05"/>
-    <geom name="marker_origin" type="cylinder" size="0.025 0.001" pos="0 0 0.001"/>
-    <geom name="marker_far_x" type="cylinder" size="0.025 0.001" pos="0.3 0 0.101"/>
+    <geom name="marker_origin" type="cylinder" size="0.08 0.001" pos="0 0 0.001"/>
+    <geom name="marker_far_x" type="cylinder" size="0.08 0.001" pos="0.3 0.1 0.101"/>
     <body name="arm" pos="0 0 0.5">
       <joint name="turns" type="hinge" axis="0 0 1"/>
       <geom name="link" type="box" size="0.05 1 0.05"/>
@@ -183,9 +183,9 @@ def test_rays_find_the_true_surface_and_no_arm(tmp_path: Path, stepped: Dataset)
     # along world y at x = 0.305: floor, step from -0.1 to 0.3, marker, floor, nothing beyond 2
     y = -0.55 + 0.01 * np.arange(300)
     expected = np.where(np.abs(y - 0.1) < 0.2, 0.1, 0.0)
-    expected = np.where(np.abs(y) < 0.0245, 0.102, expected) - 2.0
+    expected = np.where(np.abs(y - 0.1) < 0.08, 0.102, expected) - 2.0
     expected[y > 2.0] = np.nan
-    clear = np.min(np.abs(y[:, None] - [-0.1, 0.3, 2.0, -0.025, 0.025]), axis=1) > 5e-3
+    clear = np.min(np.abs(y[:, None] - [-0.1, 0.3, 2.0, 0.02, 0.18]), axis=1) > 5e-3
     assert_allclose(z[0][clear], expected[clear], atol=1e-6)
     assert TrueSurface.of(stepped) is not None
 
