@@ -139,7 +139,7 @@ def patches(points: Sequence[Floats], T_world_camera: Floats, radius: float) -> 
         around = cloud[n] - cloud[n].mean(axis=0)
         covariances[k] = around.T @ around / len(n)
     views = [np.count_nonzero(np.bincount(frame[n])) for n in near]
-    return Patches(np.linalg.eigvalsh(covariances), np.array(views, np.int64))
+    return Patches(np.asarray(np.linalg.eigvalsh(covariances), float), np.array(views, np.int64))
 
 
 def seen_nodes(

@@ -13,7 +13,7 @@ from depthba import se3
 from eval.methods.gicp import GicpOptions, align, prepare
 from eval.methods.graph import Edge, isotropic, solve, solve_robustly, spanning_tree
 from eval.methods.method import MethodError, relative
-from eval.methods.pose_graph import GicpPgo, usual_reach
+from eval.methods.pose_graph import GicpPgo, TeaserPgo, TeaserPgoGnc, usual_reach
 from eval.methods.voxel import usual_voxel
 from eval.metrics import pose_metrics
 from tests.eval.reference_scenes import made_task, reference_task
@@ -208,3 +208,24 @@ def test_frames_apart_are_said_to_be_so() -> None:
     T[1, 0, 3] = -5.0
     with pytest.raises(MethodError, match="no two frames overlap"):
         GicpPgo().run(made_task(T, clouds, spacing=4e-3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "voxel", "translation", "rotation"),
+    [("s0", 0.008, (1.1e-3, 1.1e-3), (1.6e-3, 1.6e-3)), ("s1", 0.010, (0.2, 13e-3), (0.25, 29e-3))],
+)
+def test_teaser_pairs_on_the_reference_scenes(
+    name: str, voxel: float, translation: tuple[float, float], rotation: tuple[float, float]
+) -> None:
+    """Figures of least squares, then of the robust graph; on s1 the former is lost to outliers."""
+    pairs = pytest.importorskip("eval.methods.pairs")
+    if not hasattr(pairs, "feature_pairs"):
+        pytest.skip("pairs cannot be registered by features here")
+    task, T_true, _ = reference_task(name, 0.01, 0.02)
+    options = pairs.PairOptions(voxel=voxel)
+    for k, method in enumerate((TeaserPgo(pairs=options), TeaserPgoGnc(pairs=options))):
+        found = method.run(task)
+        errors = {m.name: m.value for m in pose_metrics(found.T_world_camera, T_true)}
+        assert errors["translation_mae"] < 1.5 * translation[k]
+        assert errors["rotation_mae"] < 1.5 * rotation[k]
