@@ -103,6 +103,9 @@ class GicpPgo:
         """
         edges, failed = [], []
         for (i, j), a in zip(pairs, aligned, strict=True):
+            if not np.isfinite(a.T_target_source).all():
+                failed.append(f"frames {i} and {j}: ICP left the numbers")
+                continue
             if a.inliers < self.fewest:
                 failed.append(f"frames {i} and {j}: {a.inliers} points have a partner")
                 continue
