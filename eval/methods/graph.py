@@ -108,10 +108,13 @@ def solve_robustly(T_start: Floats, edges: Sequence[Edge], sigma_first: float = 
     return Solved(_poses(found, T_start, tied), weights, float(error), None, loose)
 
 
-def spanning_tree(T_start: Floats, edges: Sequence[Edge], support: Sequence[float]) -> Floats:
-    """Return poses (N, 4, 4) from the edges of greatest support that tie frames to frame 0.
+def spanning_tree(
+    T_start: Floats, edges: Sequence[Edge], support: Sequence[float]
+) -> tuple[Floats, list[int]]:
+    """Tie frames to frame 0 by the edges of greatest support, as few as will do.
 
-    Prim's algorithm. Frames that no edge reaches keep their start pose.
+    Prim's algorithm. Returns poses (N, 4, 4), where frames that no edge reaches keep their start
+    pose, and the edges used, by index.
 
     Args:
         T_start: (N, 4, 4).
@@ -120,7 +123,7 @@ def spanning_tree(T_start: Floats, edges: Sequence[Edge], support: Sequence[floa
 
     """
     T = np.array(T_start, dtype=np.float64)
-    reached = {0}
+    reached, used = {0}, []
     by_support = sorted(zip(support, range(len(edges)), strict=True), reverse=True)
     while True:
         for _, k in by_support:
@@ -132,9 +135,10 @@ def spanning_tree(T_start: Floats, edges: Sequence[Edge], support: Sequence[floa
             else:
                 T[edge.i] = T[edge.j] @ se3.inverse(edge.T_i_j)
             reached |= {edge.i, edge.j}
+            used.append(k)
             break
         else:
-            return T
+            return T, used
 
 
 def connected(count: int, pairs: Sequence[tuple[int, int]]) -> tuple[set[int], tuple[int, ...]]:

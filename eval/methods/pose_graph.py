@@ -124,6 +124,10 @@ class TeaserPgo:
     """The same for its rotation, rad."""
     robust: bool = False
     """Whether pairs may be rejected as outliers."""
+    fewest: int = 8
+    """A pair with fewer inliers is left out, unless nothing else ties its frames to frame 0: among
+    2000 matches so few agree by chance, and in least squares one such pair is enough to ruin all
+    poses."""
     least_overlap: float = LEAST
     """See `overlapping_pairs`."""
     pairs: PairOptions | None = None
@@ -142,11 +146,17 @@ class TeaserPgo:
             raise MethodError(f"none of {len(wanted)} overlapping pairs could be registered")
         information = isotropic(self.sigma_t, self.sigma_r)
         edges = [Edge(p.target, p.source, p.T_target_source, information) for p in found]
+        support = [len(p.inliers) for p in found]
         with watch("graph"):
             # The pair with the most inliers is the least likely to be wrong.
-            T = spanning_tree(task.T_world_camera, edges, [len(p.inliers) for p in found])
+            T, tree = spanning_tree(task.T_world_camera, edges, support)
+            chance = {k for k, s in enumerate(support) if s < self.fewest} - set(tree)
+            edges = [e for k, e in enumerate(edges) if k not in chance]
             solved = solve_robustly(T, edges) if self.robust else solve(T, edges)
         notes = [f"frames {i} and {j}: {why}" for i, j, why in failed]
+        for k in sorted(chance):
+            i, j = found[k].target, found[k].source
+            notes.append(f"frames {i} and {j}: {support[k]} matches agree, as few as by chance")
         if rejected := [f"{e.i}-{e.j}" for e, w in _weighed(edges, solved) if w < 0.5]:
             notes.append(f"pairs rejected as outliers: {', '.join(rejected)}")
         notes += _loose(solved)
