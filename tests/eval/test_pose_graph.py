@@ -189,7 +189,8 @@ def test_defaults_follow_spacing_noise_and_the_start() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "translation", "rotation"), [("s0", 0.127e-3, 0.27e-3), ("s1", 1.7e-3, 3.1e-3)]
+    ("name", "translation", "rotation"),
+    [("s0", 0.127e-3, 0.27e-3), pytest.param("s1", 1.7e-3, 3.1e-3, marks=pytest.mark.slow)],
 )
 def test_reference_scenes(name: str, translation: float, rotation: float) -> None:
     task, T_true, _ = reference_task(name, 0.01, 0.02)
