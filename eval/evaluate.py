@@ -6,7 +6,7 @@ import importlib.util
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import durable, se3, trajectory
-from depthba.clouds import load_clouds, point_spacing
+from depthba.clouds import inside, load_clouds, point_spacing, transform
 from depthba.dataset import Dataset
+from depthba.depth_map import DepthMap
 from depthba.errors import OptionError, RunError
 from depthba.picture import CELL_SPACINGS
 from depthba.run_folder import Run
 from eval.bound import Bound
 from eval.bound import bound as cramer_rao
+from eval.map_metrics import cloud_metrics, height_metrics, patches, seen_nodes
+from eval.marker_metrics import marker_metrics
 from eval.metrics import Metric, consistency, over_bound, pose_metrics, start
 from eval.review import RECORDING
 from eval.self_consistency import agreement, map_rotation
+from eval.true_map import TrueSurface
 
 Floats = NDArray[np.float64]
 
+PATCH_CELLS = 1.5
+"""Radius of the neighbourhoods in which the common cloud's sharpness is judged, in cells."""
 SAME_STAMP = 1e-6
 """Stamps that differ by no more than this, s, are one frame."""
 
@@ -160,8 +166,22 @@ def judge(
         )
         for T in (T_start, T_est)
     ]
-    before += agreements[0].metrics()
-    metrics += agreements[1].metrics()
+    markers, ids = data.markers(), [data.ids[k] for k in rows]
+    for T, agreed, figures in zip((T_start, T_est), agreements, (before, metrics), strict=True):
+        figures += agreed.metrics()
+        figures += patches(points, T, PATCH_CELLS * cell).metrics()
+        figures += marker_metrics(markers, ids, T)
+    surface = None if T_true is None else TrueSurface.of(data)
+    if T_true is not None and surface is not None:
+        world = [transform(T, p) for T, p in zip(T_true, points, strict=True)]
+        roi = opened.config.get("roi")
+        for depth_map, T, figures in (
+            (opened.depth_map_start, T_start, before),
+            (opened.depth_map, T_est, metrics),
+        ):
+            if depth_map is not None:
+                T_true_world = T_true[0] @ se3.inverse(T[0])
+                figures += _map_metrics(depth_map, T_true_world, surface, world, roi)
     return Evaluation(
         run=opened,
         dataset=data,
@@ -174,6 +194,42 @@ def judge(
         bound=least,
         seconds=time.perf_counter() - began,
     )
+
+
+def _map_metrics(
+    found: DepthMap,
+    T_true_world: Floats,
+    surface: TrueSurface,
+    world: Sequence[Floats],
+    roi: Sequence[float] | None,
+) -> list[Metric]:
+    """Judge a map by the true surface.
+
+    Args:
+        found: the map.
+        T_true_world: (4, 4), puts the world of its poses onto the true one.
+        surface: the truth.
+        world: the points of each frame (n_i, 3) at its true pose: where they are, the map should
+            have heights.
+        roi: region of interest in the map frame; nodes outside do not count.
+
+    """
+    grid = found.origin, found.spacing, found.shape
+    T_true_map = T_true_world @ se3.inverse(found.T_map_world)
+    T_map_true = se3.inverse(T_true_map)
+    true = surface.heights(T_true_map, *grid)
+    expected = seen_nodes(world, T_map_true, *grid)
+    if roi is not None:
+        p_map = replace(found, heights=true, T_map_world=np.eye(4)).vertices()
+        expected &= inside(p_map.reshape(-1, 3), roi).reshape(found.shape)
+    clouds = []
+    for z in (found.heights, true):
+        there = replace(found, heights=np.where(expected, z, np.nan)).vertices()
+        clouds.append(there[np.isfinite(there).all(axis=-1)])
+    return [
+        *height_metrics(found.heights, true, expected, found.spacing),
+        *cloud_metrics(*clouds),
+    ]
 
 
 def as_json(judged: Evaluation) -> dict[str, Any]:
