@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from depthba import se3
 from eval.methods.method import MethodError
+from eval.methods.teaser.choice import most_consistent
 from eval.methods.teaser.clique import maximum_clique
 from eval.methods.teaser.graph import consistency_graph, edge_count
 from eval.methods.teaser.rotation import gnc_rotation
@@ -100,7 +101,8 @@ def register(src: ArrayLike, dst: ArrayLike, options: TeaserOptions | None = Non
         return register_original(src, dst, options)
     graph = consistency_graph(src, dst, 2 * options.noise_bound)
     clique = maximum_clique(graph, options.clique_seconds)
-    return solve_clique(src, dst, clique.vertices, options, edge_count(graph), clique.proven)
+    vertices = most_consistent(graph, src, dst, clique.vertices)
+    return solve_clique(src, dst, vertices, options, edge_count(graph), clique.proven)
 
 
 def solve_clique(
