@@ -18,7 +18,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from eval.methods.teaser.bits import WORD, bit, lowest, population, size
+from eval.methods.teaser.bits import WORD, bit, lowest, size
 from eval.methods.teaser.graph import Words, degrees
 
 Ints = NDArray[np.int64]
@@ -171,9 +171,7 @@ def _state(adjacency: Words, deepest: int, best: int) -> tuple[NDArray, ...]:
     depth = deepest + 2
     candidates = np.zeros((depth, words), np.uint64)
     every = np.arange(n)
-    np.bitwise_or.at(
-        candidates[0], every // WORD, np.uint64(1) << (every % WORD).astype(np.uint64)
-    )
+    np.bitwise_or.at(candidates[0], every // WORD, np.uint64(1) << (every % WORD).astype(np.uint64))
     order, colour = np.empty((depth, n), np.int32), np.empty((depth, n), np.int32)
     length = np.full(depth, -1, np.int64)
     return (
