@@ -81,7 +81,7 @@ def describe(points: Floats, voxel: float) -> Keypoints:
     around = o3d.geometry.KDTreeSearchParamHybrid
     cloud.estimate_normals(around(NORMAL_RADIUS * voxel, NORMAL_NEIGHBOURS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
-    fpfh = o3d.pipelines.registration.compute_fpfh_feature(
+    fpfh = o3d.pipelines.registration.compute_fpfh_feature(  # type: ignore[call-arg]
         cloud, around(FEATURE_RADIUS * voxel, FEATURE_NEIGHBOURS)
     )
     return Keypoints(np.array(cloud.points), np.ascontiguousarray(fpfh.data.T))

@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 
 from eval.methods.teaser.bits import WORD, bit, lowest, size
 from eval.methods.teaser.graph import Words, degrees
+from eval.methods.teaser.local_search import exchanged
 
 Ints = NDArray[np.int64]
 
-BRANCHES = 2000
-"""Between two looks at the clock."""
+BRANCHES = 500
+"""Of the tree, between two looks at the clock."""
+EXCHANGES = 4
+"""Steps of the search for a better clique before the proof, per vertex left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +57,22 @@ def maximum_clique(adjacency: Words, seconds: float = 30.0) -> Clique:
     ordered = subgraph(adjacency, order)
     best = greedy_clique(ordered, cores[order])
     kept = np.flatnonzero(cores[order] >= len(best))
-    proven, branches = True, 0
-    if len(kept):
-        few = subgraph(ordered, kept)
+    if not len(kept):
+        return Clique(np.sort(order[best]), True, 0)
+    few = subgraph(ordered, kept)
+    state = _state(few, int(cores.max()), len(best))
+    if _branch(few, *state, 0):
+        return Clique(np.sort(order[best]), True, 0)
+    better = exchanged(few, np.flatnonzero(np.isin(kept, best)), EXCHANGES * len(few))
+    if len(better) > len(best):
+        best = kept[better]
         state = _state(few, int(cores.max()), len(best))
-        while not (proven := bool(_branch(few, *state, BRANCHES))) and time.monotonic() < until:
-            pass
-        counts, found = state[-2:]
-        branches = int(counts[_BRANCHES])
-        if counts[_BEST] > len(best):
-            best = kept[found[: counts[_BEST]]]
-    return Clique(np.sort(order[best]), proven, branches)
+    while not (proven := bool(_branch(few, *state, BRANCHES))) and time.monotonic() < until:
+        pass
+    counts, found = state[-2:]
+    if counts[_BEST] > len(best):
+        best = kept[found[: counts[_BEST]]]
+    return Clique(np.sort(order[best]), proven, int(counts[_BRANCHES]))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -191,7 +199,7 @@ def _branch(adjacency, candidates, order, colour, length, classes, chosen, count
     """
     words = adjacency.shape[1]
     d = counts[_DEPTH]
-    while budget > 0:
+    while True:
         if length[d] < 0:
             length[d] = _coloured(
                 adjacency, candidates[d], counts[_BEST] - d, classes, order[d], colour[d]
@@ -204,6 +212,9 @@ def _branch(adjacency, candidates, order, colour, length, classes, chosen, count
                 return True
             d -= 1
             continue
+        if budget == 0:
+            counts[_DEPTH] = d
+            return False
         length[d] = k
         budget -= 1
         counts[_BRANCHES] += 1
@@ -220,8 +231,6 @@ def _branch(adjacency, candidates, order, colour, length, classes, chosen, count
         elif d + 1 > counts[_BEST]:
             counts[_BEST] = d + 1
             found[: d + 1] = chosen[: d + 1]
-    counts[_DEPTH] = d
-    return False
 
 
 @nb.njit(cache=True, nogil=True)
