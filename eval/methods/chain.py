@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import pairwise
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,18 +91,18 @@ class Kiss:
     """KISS-Matcher on consecutive frames, chained from the first frame's start pose.
 
     Lim et al., "KISS-Matcher: Fast and Robust Point Cloud Registration Revisited", ICRA 2025, by
-    its authors' package, whose own radii and bounds are multiples of the voxel.
+    its authors' package, whose own radii and bounds are multiples of the voxel. Its answer repeats
+    with one thread only.
     """
 
     voxel: float | None = None
     """Edge of the cubes that points are thinned to, m; None: by `features.usual_voxel`."""
     least_inliers: int = 5
-    """Matches that agree; a pair with fewer failed, as the package's authors advise."""
+    """Matches that agree; a pair with fewer failed."""
 
     def run(self, task: Task) -> Estimate:
         """Register the frames; a pair that fails keeps how the start has it."""
-        import kiss_matcher
-
+        package = _loaded_kiss(task.threads)
         watch = Stopwatch()
         steps, notes = {}, []
         with watch("register"):
@@ -109,8 +113,12 @@ class Kiss:
                     notes.append(_failed(k, k + 1, "too few points"))
                     continue
                 # A new one each time: what it keeps of the last pair must not matter.
-                matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel))
-                found = matcher.estimate(*(list(p.astype(np.float32)) for p in (source, target)))
+                matcher = package.KISSMatcher(package.KISSMatcherConfig(voxel))
+                matched = matcher.match(np.asfortranarray(source.T), np.asfortranarray(target.T))
+                if len(matched[0]) < self.least_inliers:
+                    notes.append(_failed(k, k + 1, f"{len(matched[0])} matches"))
+                    continue
+                found = matcher.prune_and_solve(*matched)
                 T = se3.make(np.asarray(found.rotation), np.asarray(found.translation).reshape(3))
                 inliers = matcher.get_num_final_inliers()
                 if not found.valid or inliers < self.least_inliers or not se3.is_rigid(T, 1e-3):
@@ -118,6 +126,26 @@ class Kiss:
                 else:
                     steps[k] = T
         return _estimate(task, steps, watch, notes)
+
+
+@cache
+def _loaded_kiss(threads: int) -> ModuleType:
+    """Return the package, told how many threads to use.
+
+    Its threads share out work by chance, and its answer depends on that by millimetres. It has no
+    setting for their number, but asks once how many cores this thread may use: when it first works.
+    """
+    every = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+    if every:
+        os.sched_setaffinity(0, sorted(every)[:threads])
+    try:
+        package = importlib.import_module("kiss_matcher")
+        points = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 2000))
+        package.KISSMatcher(package.KISSMatcherConfig(0.1)).match(points, points)
+    finally:
+        if every:
+            os.sched_setaffinity(0, every)
+    return package
 
 
 def _teaser_steps(
