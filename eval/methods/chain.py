@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from eval.methods.features import usual_voxel
+from eval.methods.features import REACH, near_clouds, usual_voxel
 from eval.methods.method import Estimate, MethodError, Stopwatch, Task, chained, relative
 from eval.methods.pairs import PairOptions, feature_pairs, pair_voxel
 
@@ -57,13 +57,14 @@ class TeaserIcp:
         steps, notes = _teaser_steps(task, self.pairs, watch)
         refined = dict(steps)
         with watch("icp"):
+            clouds = near_clouds(task, self.pairs.reach)
             ready: dict[int, tuple] = {}
             for k, T_start in steps.items():
                 task.say(f"GICP, pair {k + 1}/{len(task) - 1}")
                 for i in (k, k + 1):
                     if i not in ready:
                         ready[i] = small_gicp.preprocess_points(
-                            task.clouds[i],
+                            clouds[i],
                             downsampling_resolution=self.downsample * voxel,
                             num_threads=task.threads,
                         )
@@ -97,6 +98,8 @@ class Kiss:
 
     voxel: float | None = None
     """Edge of the cubes that points are thinned to, m; None: by `features.usual_voxel`."""
+    reach: float = REACH
+    """How far points are used, in a frame's median ranges; see `features.near`."""
     least_inliers: int = 5
     """Matches that agree; a pair with fewer failed."""
 
@@ -106,8 +109,9 @@ class Kiss:
         watch = Stopwatch()
         steps, notes = {}, []
         with watch("register"):
-            voxel = self.voxel or usual_voxel(task.clouds, task.spacing)
-            for k, (target, source) in enumerate(pairwise(task.clouds)):
+            clouds = near_clouds(task, self.reach)
+            voxel = self.voxel or usual_voxel(clouds, task.spacing)
+            for k, (target, source) in enumerate(pairwise(clouds)):
                 task.say(f"KISS-Matcher, pair {k + 1}/{len(task) - 1}")
                 if min(len(target), len(source)) < LEAST_POINTS:
                     notes.append(_failed(k, k + 1, "too few points"))

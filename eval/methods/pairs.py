@@ -32,6 +32,8 @@ class PairOptions:
 
     voxel: float | None = None
     """Edge of the cubes that points are thinned to, m; None: by `features.usual_voxel`."""
+    reach: float = features.REACH
+    """How far points are described, in a frame's median ranges; see `features.near`."""
     noise_bound: float = 0.75
     """Largest error of a matched point that counts as noise, in voxels."""
     most_matches: int = 2000
@@ -79,7 +81,7 @@ def feature_pairs(
 
     """
     voxel = pair_voxel(task, options, watch)
-    described = keypoints(task, voxel, watch)
+    described = keypoints(task, voxel, watch, options.reach)
     kept = Cache(task.cache)
     digests = _digests(task)
     found, failed = [], []
@@ -110,29 +112,33 @@ def pair_voxel(task: Task, options: PairOptions, watch: Stopwatch) -> float:
     if options.voxel is not None:
         return options.voxel
     with watch("features"):
-        return features.usual_voxel(task.clouds, task.spacing)
+        return features.usual_voxel(features.near_clouds(task, options.reach), task.spacing)
 
 
-def keypoints(task: Task, voxel: float, watch: Stopwatch) -> list[Keypoints]:
+def keypoints(
+    task: Task, voxel: float, watch: Stopwatch, reach: float = features.REACH
+) -> list[Keypoints]:
     """Return the keypoints of all frames; ``watch`` is charged with the stage "features".
 
     Args:
         task: the frames.
         voxel: edge of the cubes that points are thinned to, m.
         watch: is charged with what frames out of the cache took when they were made.
+        reach: how far points are described, in a frame's median ranges.
 
     """
     kept = Cache(task.cache)
+    reach = reach if task.dataset.sensor.origin else float("inf")
     expected = {"points": ("f", 2), "descriptors": ("f", 2), "seconds": ("f", 0)}
     described = []
     for k, (cloud, known) in enumerate(zip(task.clouds, _digests(task), strict=True)):
         task.say(f"features, frame {k + 1}/{len(task)}")
-        key = {**_base(voxel), "frame": known}
+        key = {**_base(voxel), "reach": reach, "frame": known}
         arrays = kept.get("keypoints", key, expected)
         if arrays is None:
             _warm()
             began = time.perf_counter()
-            one = features.describe(cloud, voxel)
+            one = features.describe(features.near(cloud, reach), voxel)
             seconds = time.perf_counter() - began
             arrays = {
                 "points": one.points,
