@@ -1,0 +1,70 @@
+"""Point clusters: the sums that say all of a set of points that a plane through it needs.
+
+A cluster is the symmetric ``C = [[Σ p pᵀ, Σ p], [Σ pᵀ, N]]`` (4, 4), in m², m and 1 (definition 1 of
+the paper): what the points' homogeneous coordinates sum to. Moved by a pose it is ``T C Tᵀ``, and
+sets are joined by adding: however many points there are, a cost or a step visits only clusters.
+"""
+
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@nb.njit(cache=True, nogil=True)
+def cluster_points(points, slot, count):
+    """Sum points by slot.
+
+    Args:
+        points: (n, 3), m, float32 or float64; summed in double precision.
+        slot: (n,) the cluster of each.
+        count: number of clusters.
+
+    Returns:
+        (count, 4, 4) float64.
+
+    """
+    C = np.zeros((count, 4, 4))
+    for k in range(points.shape[0]):
+        c = C[slot[k]]
+        x, y, z = np.float64(points[k, 0]), np.float64(points[k, 1]), np.float64(points[k, 2])
+        c[0, 0] += x * x
+        c[0, 1] += x * y
+        c[0, 2] += x * z
+        c[0, 3] += x
+        c[1, 1] += y * y
+        c[1, 2] += y * z
+        c[1, 3] += y
+        c[2, 2] += z * z
+        c[2, 3] += z
+        c[3, 3] += 1.0
+    for k in range(count):
+        for i in range(1, 4):
+            for j in range(i):
+                C[k, i, j] = C[k, j, i]
+    return C
+
+
+def move_clusters(T: Floats, C: Floats) -> Floats:
+    """Return clusters ``C`` (..., 4, 4) after poses ``T`` (..., 4, 4)."""
+    return np.asarray(T @ C @ np.swapaxes(T, -1, -2))
+
+
+def join_clusters(C: Floats, owner: Ints, count: int) -> Floats:
+    """Return (count, 4, 4), the sums of clusters (k, 4, 4) by ``owner`` (k,)."""
+    columns = C.reshape(len(C), 16).T
+    joined = np.stack([np.bincount(owner, column, minlength=count) for column in columns], axis=1)
+    return np.asarray(joined.reshape(count, 4, 4))
+
+
+def covariances(C: Floats) -> tuple[Floats, Floats]:
+    """Return the centres (k, 3), m, and biased covariances (k, 3, 3), m², of clusters (k, 4, 4)."""
+    N = C[:, 3, 3]
+    centre = C[:, :3, 3] / N[:, None]
+    return centre, C[:, :3, :3] / N[:, None, None] - centre[:, :, None] * centre[:, None, :]
