@@ -51,16 +51,37 @@ def cluster_points(points, slot, count):
     return C
 
 
-def move_clusters(T: Floats, C: Floats) -> Floats:
-    """Return clusters ``C`` (..., 4, 4) after poses ``T`` (..., 4, 4)."""
-    return np.asarray(T @ C @ np.swapaxes(T, -1, -2))
+@nb.njit(cache=True, nogil=True)
+def move_clusters(T, C):
+    """Return clusters ``C`` (k, 4, 4) after poses ``T`` (k, 4, 4)."""
+    out = np.empty_like(C)
+    half = np.empty((4, 4))
+    for k in range(C.shape[0]):
+        t, c, moved = T[k], C[k], out[k]
+        for i in range(4):
+            for j in range(4):
+                half[i, j] = (t[i, 0] * c[0, j] + t[i, 1] * c[1, j]) + (
+                    t[i, 2] * c[2, j] + t[i, 3] * c[3, j]
+                )
+        for i in range(4):
+            for j in range(i + 1):
+                moved[i, j] = (half[i, 0] * t[j, 0] + half[i, 1] * t[j, 1]) + (
+                    half[i, 2] * t[j, 2] + half[i, 3] * t[j, 3]
+                )
+                moved[j, i] = moved[i, j]
+    return out
 
 
-def join_clusters(C: Floats, owner: Ints, count: int) -> Floats:
+@nb.njit(cache=True, nogil=True)
+def join_clusters(C, owner, count):
     """Return (count, 4, 4), the sums of clusters (k, 4, 4) by ``owner`` (k,)."""
-    columns = C.reshape(len(C), 16).T
-    joined = np.stack([np.bincount(owner, column, minlength=count) for column in columns], axis=1)
-    return np.asarray(joined.reshape(count, 4, 4))
+    joined = np.zeros((count, 4, 4))
+    for k in range(C.shape[0]):
+        whole = joined[owner[k]]
+        for i in range(4):
+            for j in range(4):
+                whole[i, j] += C[k, i, j]
+    return joined
 
 
 def covariances(C: Floats) -> tuple[Floats, Floats]:

@@ -127,25 +127,28 @@ def _leaves(
     if not len(points):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4))
     root, octant = _locate(points, frame, np.ascontiguousarray(T_world_camera), size, layers)
-    root -= root.min(axis=0)
-    extent = root.max(axis=0) + 1
-    number = (root[:, 0] * extent[1] + root[:, 1]) * extent[2] + root[:, 2]
+    root -= root.min(axis=1, keepdims=True)
+    extent = root.max(axis=1) + 1
+    number = (root[0] * extent[1] + root[1]) * extent[2] + root[2]
     if float(np.prod(extent.astype(float))) * 8.0 ** (layers - 1) * len(clouds) > 2.0**62:
         raise OptionError(f"voxel size {size} m: too small for a scene of {extent} voxels")
     key = ((number << (3 * (layers - 1))) | octant) * len(clouds) + frame
-    keys, slot = np.unique(key, return_inverse=True)
+    # neighbours in a cloud mostly share a leaf: only where the leaf changes is there what to sort
+    begins = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
+    keys, slot = np.unique(key[begins], return_inverse=True)
+    slot = np.repeat(slot, np.diff(begins, append=len(key)))
     leaf, leaf_frame = np.divmod(keys, len(clouds))
     return leaf, leaf_frame, cluster_points(points, slot, len(keys))
 
 
 @nb.njit(cache=True, nogil=True)
 def _locate(points, frame, T_world_camera, size, layers):
-    """Return the root voxel (n, 3) of each point and its octants (n,), three bits a layer.
+    """Return the root voxel (3, n) of each point and its octants (n,), three bits a layer.
 
     Roots and centres of voxels are told apart in single precision, as the authors' program does:
     points on a border then fall to the same side.
     """
-    root = np.empty((points.shape[0], 3), np.int64)
+    root = np.empty((3, points.shape[0]), np.int64)
     octant = np.zeros(points.shape[0], np.int64)
     for k in range(points.shape[0]):
         T = T_world_camera[frame[k]]
@@ -157,7 +160,7 @@ def _locate(points, frame, T_world_camera, size, layers):
             if cell < 0:
                 cell -= np.float32(1.0)
             index = np.int64(cell)
-            root[k, axis] = index
+            root[axis, k] = index
             centre = np.float32((0.5 + index) * size)
             quarter = np.float32(size / 4.0)
             for layer in range(1, layers):
