@@ -54,7 +54,7 @@ class LandmarkSolution:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Normal equations: ``H`` over poses, and over landmarks ``W``; E couples row by row."""
+    """The residuals to first order, ``r + A [tau, phi] - dl``, and what each counts."""
 
     weight: Floats
     """(k,) of each observation."""
@@ -87,14 +87,12 @@ def linearise(
 def cost(residual: Floats, huber: float) -> float:
     """Return the sum of Huber's losses of residuals (k, 3), m²."""
     length = np.linalg.norm(residual, axis=1)
-    return float(
-        np.where(length < huber, length**2 / 2, huber * (length - huber / 2)).sum()
-    )
+    return float(np.where(length < huber, length**2 / 2, huber * (length - huber / 2)).sum())
 
 
-def step(tracks: Tracks, lin: Linearisation, damping: float, moves: NDArray[np.bool_]) -> tuple[
-    Floats, Floats
-]:  # fmt: skip
+def step(
+    tracks: Tracks, lin: Linearisation, damping: float, moves: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
     """Solve the damped normal equations.
 
     Args:
@@ -109,32 +107,32 @@ def step(tracks: Tracks, lin: Linearisation, damping: float, moves: NDArray[np.b
     """
     n, w = tracks.frames, lin.weight
     wA = w[:, None, None] * lin.A
-    own = np.swapaxes(lin.A, 1, 2) @ wA
-    H, g = np.zeros((n, 6, 6)), np.zeros((n, 6))
-    np.add.at(H, tracks.frame, own)
-    np.add.at(g, tracks.frame, np.einsum("kia,ki->ka", wA, lin.residual))
-    H[:, np.arange(6), np.arange(6)] *= 1 + damping
+    own, g = np.zeros((n, 6, 6)), np.zeros((n, 6))
+    np.add.at(own, tracks.frame, np.swapaxes(lin.A, 1, 2) @ wA)
+    own[:, np.arange(6), np.arange(6)] *= 1 + damping
     W = (1 + damping) * np.bincount(tracks.track, w, minlength=len(tracks))
-    b = np.stack(
-        [np.bincount(tracks.track, w * r, minlength=len(tracks)) for r in lin.residual.T], axis=1
-    )  # minus the landmarks' gradient
+    pull = _sum_by_track(tracks, w[:, None] * lin.residual)
+    # where the landmarks go if the poses stay
+    left = lin.residual - (pull / W[:, None])[tracks.track]
+    np.add.at(g, tracks.frame, np.einsum("kia,ki->ka", wA, left))
 
-    S = np.zeros((6 * n, 6 * n))
-    for i in range(n):
-        S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = H[i]
+    S = np.zeros((n, 6, n, 6))
+    S[np.arange(n), :, np.arange(n), :] = own
+    S = S.reshape(6 * n, 6 * n)
     first = np.searchsorted(tracks.track, np.arange(len(tracks) + 1))
     _eliminate(first, tracks.frame, wA, 1 / W, S)
-    np.add.at(g, tracks.frame, -np.einsum("kia,ki->ka", wA, (b / W[:, None])[tracks.track]))
-
     free = np.repeat(moves, 6)
     delta = np.zeros(6 * n)
     delta[free] = -np.linalg.solve(S[np.ix_(free, free)], g.ravel()[free])
     delta = delta.reshape(n, 6)
-    push = np.einsum("kia,ka->ki", wA, delta[tracks.frame])
-    back = np.stack(
-        [np.bincount(tracks.track, p, minlength=len(tracks)) for p in push.T], axis=1
-    )
-    return delta, (b + back) / W[:, None]
+
+    pull += _sum_by_track(tracks, np.einsum("kia,ka->ki", wA, delta[tracks.frame]))
+    return delta, pull / W[:, None]
+
+
+def _sum_by_track(tracks: Tracks, rows: Floats) -> Floats:
+    """Return (L, 3), the sums of rows (k, 3)."""
+    return np.stack([np.bincount(tracks.track, x, minlength=len(tracks)) for x in rows.T], axis=1)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -194,6 +192,4 @@ def _means(tracks: Tracks, T_world_camera: Floats) -> Floats:
     """Return where each landmark is seen on average (L, 3), m."""
     seen = residuals(tracks, T_world_camera, np.zeros((len(tracks), 3)))
     count = np.bincount(tracks.track, minlength=len(tracks))
-    return np.stack(
-        [np.bincount(tracks.track, x, minlength=len(tracks)) / count for x in seen.T], axis=1
-    )
+    return _sum_by_track(tracks, seen) / count[:, None]

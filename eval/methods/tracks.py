@@ -44,6 +44,32 @@ class Link:
     """(m, 2), rows of the points of frames a and b."""
 
 
+def tied_frames(tracks: Tracks, fewest: int = 3) -> NDArray[np.bool_]:
+    """Return (N,), which frames landmarks tie to frame 0.
+
+    A frame is tied where it sees as many landmarks as ``fewest`` that tied frames see; three fix a
+    pose.
+    """
+    tied = np.zeros(tracks.frames, dtype=bool)
+    tied[0] = True
+    while True:
+        placed = np.bincount(tracks.track, tied[tracks.frame], minlength=len(tracks)) > 0
+        seen = np.bincount(tracks.frame, placed[tracks.track], minlength=tracks.frames)
+        grown = tied | (seen >= fewest)
+        if np.array_equal(grown, tied):
+            return tied
+        tied = grown
+
+
+def only_frames(tracks: Tracks, frames: NDArray[np.bool_]) -> Tracks:
+    """Return what some of the frames (N,) observe, of landmarks that two of them see or more."""
+    keep = frames[tracks.frame]
+    seen = np.bincount(tracks.track[keep], minlength=len(tracks))
+    keep &= seen[tracks.track] >= 2
+    _, track = np.unique(tracks.track[keep], return_inverse=True)
+    return Tracks(tracks.frames, track, tracks.frame[keep], tracks.points[keep], tracks.dropped)
+
+
 def build_tracks(points: Sequence[Floats], links: Sequence[Link]) -> Tracks:
     """Join matches to tracks.
 
@@ -58,9 +84,11 @@ def build_tracks(points: Sequence[Floats], links: Sequence[Link]) -> Tracks:
     first = np.concatenate([[0], np.cumsum([len(p) for p in points])])
     for link in links:
         for k, rows in ((link.a, link.matches[:, 0]), (link.b, link.matches[:, 1])):
-            if len(rows) and not (0 <= rows.min() and rows.max() < len(points[k])):
-                raise ValueError(f"matches of frames {link.a} and {link.b}: frame {k} has only "
-                                 f"{len(points[k])} points")  # fmt: skip
+            if len(rows) and (rows.min() < 0 or rows.max() >= len(points[k])):
+                raise ValueError(
+                    f"match of frames {link.a} and {link.b}: row {rows.max()} of frame {k}, which "
+                    f"has {len(points[k])} points"
+                )
     empty = np.zeros(0, dtype=np.int64)
     a = np.concatenate([empty, *(first[k.a] + k.matches[:, 0] for k in links)])
     b = np.concatenate([empty, *(first[k.b] + k.matches[:, 1] for k in links)])

@@ -1,8 +1,8 @@
 """Point clusters: the sums that say all of a set of points that a plane through it needs.
 
-A cluster is the symmetric ``C = [[Σ p pᵀ, Σ p], [Σ pᵀ, N]]`` (4, 4), in m², m and 1 (definition 1 of
-the paper): what the points' homogeneous coordinates sum to. Moved by a pose it is ``T C Tᵀ``, and
-sets are joined by adding: however many points there are, a cost or a step visits only clusters.
+A cluster is the symmetric ``C = [[Σ p pᵀ, Σ p], [Σ pᵀ, N]]`` (4, 4), in m², m and 1: what the
+products of the points' homogeneous coordinates sum to. Moved by a pose it is ``T C Tᵀ``, and sets
+are joined by adding: however many points there are, a cost or a step visits only clusters.
 """
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False

@@ -1,8 +1,8 @@
 """The cost of planes, Σ N λ_min, with its gradient and its exact Hessian.
 
 λ_min is the least eigenvalue of the covariance of all points of a plane, in the world: N λ_min is
-the sum of their squared distances from the best plane, which thereby is gone from the problem
-(theorem 1 of the paper). Pose j moves by ``x_j = [w, d]``, ``R <- Exp(w) R``, ``p <- Exp(w) p + d``.
+the sum of their squared distances from the best plane, which thereby is gone from the problem. Pose
+j moves by ``x_j = [w, d]``: ``R <- Exp(w) R``, ``p <- Exp(w) p + d``.
 
 With the plane's normal u, its other axes u_l, its centre m, a point q = m + r and what moves it
 along u, ``a = [q x u, u]``, the terms of second order of N λ_min are
@@ -11,8 +11,8 @@ along u, ``a = [q x u, u]``, the terms of second order of N λ_min are
     H_jk -= 2/N (Σ_j a) (Σ_k a)ᵀ         the centre moves, too
     H_jk += Σ_l 2 / (N (λ - λ_l)) c_jl c_klᵀ     the normal turns, c_jl = Σ_j ((u_l.r) a + e a_l)
 
-and the gradient is ``J_j = 2 Σ_j e a`` (theorem 2, in other words). All sums are moments of clusters,
-so a plane costs what the frames that see it cost; the points are not visited.
+and the gradient is ``J_j = 2 Σ_j e a``. All sums are moments of clusters, so a plane costs what the
+frames that see it cost; the points are not visited.
 """
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt with the exact Hessian, section VI of the paper."""
+"""Levenberg-Marquardt with the exact Hessian; the damping follows how well steps were foreseen."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from eval.methods.balm2.clusters import Floats
+from eval.methods.balm2.clusters import Floats, join_clusters
 from eval.methods.balm2.cost import cost, linearise, retract
 from eval.methods.balm2.voxels import Planes
 
@@ -25,6 +25,9 @@ class SolverOptions:
     """At most, turned-down steps included."""
     tolerance: float = 1e-6
     """Relative change of the cost at which to stop."""
+    reach: float = float("inf")
+    """Farthest that a frame's points may go from where their planes were found, root mean square,
+    m: steps beyond are turned down. The paper has no such bound."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Solution:
 def solve(
     planes: Planes,
     T_world_camera: Floats,
-    options: SolverOptions = SolverOptions(),  # noqa: B008
+    options: SolverOptions = SolverOptions(),
     moves: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Move the frames to least cost.
@@ -87,7 +90,8 @@ def solve(
         after = cost(planes, moved)
         trials.append(Trial(now, after, damping))
         change = (now - after) / now if now > 0 else 0.0
-        if after < now:
+        near = displacement(planes, T_world_camera, moved).max() <= options.reach
+        if after < now and near:
             # how well the quadratic foresaw the gain says how far to trust it next
             ratio = (now - after) / (0.5 * float(x @ (damping * D * x - J)))
             damping *= max(1 / 3, 1 - (2 * ratio - 1) ** 3)
@@ -99,8 +103,25 @@ def solve(
         else:
             damping *= growth
             growth *= 2.0
-            if abs(change) < options.tolerance:
+            if near and abs(change) < options.tolerance:
                 break
     if moves[0]:
         T = se3.align_first(T, T_world_camera)
     return Solution(T, now, tuple(trials))
+
+
+def displacement(planes: Planes, T_a: Floats, T_b: Floats) -> Floats:
+    """Return how far the points on planes are apart (N,), m, root mean square by frame.
+
+    0 for a frame that sees no plane.
+
+    Args:
+        planes: whose points.
+        T_a: (N, 4, 4), the frames' poses.
+        T_b: (N, 4, 4), others.
+
+    """
+    C = join_clusters(planes.clusters, planes.frame, planes.frames)
+    apart = (T_b - T_a)[:, :3]
+    squares = np.einsum("nij,njk,nik->n", apart, C, apart)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(C[:, 3, 3], 1.0)))

@@ -1,6 +1,6 @@
 """Planes from adaptive voxels: cubes that split in eight until what they hold is flat.
 
-Section V of the paper. The association is made once, at given poses, and frozen while they are
+The association is made once, at given poses, and frozen while they are
 optimised.
 """
 
