@@ -116,15 +116,14 @@ def step(
     left = lin.residual - (pull / W[:, None])[tracks.track]
     np.add.at(g, tracks.frame, np.einsum("kia,ki->ka", wA, left))
 
-    S = np.zeros((n, 6, n, 6))
-    S[np.arange(n), :, np.arange(n), :] = own
-    S = S.reshape(6 * n, 6 * n)
+    blocks = np.zeros((n, 6, n, 6))
+    blocks[np.arange(n), :, np.arange(n), :] = own
+    S = blocks.reshape(6 * n, 6 * n)
     first = np.searchsorted(tracks.track, np.arange(len(tracks) + 1))
     _eliminate(first, tracks.frame, wA, 1 / W, S)
     free = np.repeat(moves, 6)
-    delta = np.zeros(6 * n)
-    delta[free] = -np.linalg.solve(S[np.ix_(free, free)], g.ravel()[free])
-    delta = delta.reshape(n, 6)
+    delta = np.zeros((n, 6))
+    delta[moves] = -np.linalg.solve(S[np.ix_(free, free)], g.ravel()[free]).reshape(-1, 6)
 
     pull += _sum_by_track(tracks, np.einsum("kia,ka->ki", wA, delta[tracks.frame]))
     return delta, pull / W[:, None]

@@ -40,8 +40,8 @@ class Balm2CoarseToFine:
     """As well as it goes: voxels halve, and in each size planes are found until the poses settle.
 
     Beyond the paper, too, a solution may not lead points away from where their planes were found,
-    by more than a quarter of a voxel. A size at which most planes are lost, which is noise, is left
-    out.
+    by more than a quarter of a voxel, nor all solutions of one size by more than a whole one. A size
+    at which most planes are lost, because it shows noise, is left out.
     """
 
     coarsest: float | None = None
@@ -65,6 +65,7 @@ class Balm2CoarseToFine:
             rounds=self.rounds,
             least_share=0.25,
             reach=0.25,
+            farthest=1.0,
         )
         return _run(task, schedule)
 

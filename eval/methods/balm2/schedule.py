@@ -41,6 +41,10 @@ class Schedule:
     least_share: float = 0.0
     """A size leaves at least this part of the share of points on planes that the one before had:
     smaller voxels see noise, not surface. Otherwise the result is that of the size before."""
+    farthest: float = float("inf")
+    """A size that takes a frame's points farther than that from where it found them, root mean
+    square, in voxels, is passed over: planes were not there to lead so far. (Voxels of half a
+    frame's extent let frames fall onto each other.)"""
     least_planes: int = 6
     """A frame that sees fewer planes stays where it is."""
     search: VoxelOptions = field(default_factory=VoxelOptions)
@@ -78,8 +82,8 @@ class Registered:
     """(N, 4, 4), the first frame's as it was."""
     stages: tuple[Stage, ...]
     """Whose result that is, in order."""
-    refused: str = ""
-    """Why voxels that were asked for are not among them; empty where all are."""
+    refused: tuple[str, ...] = ()
+    """Why voxels that were asked for are not among them, one line each."""
 
 
 def register(
@@ -107,32 +111,32 @@ def register(
     T = np.asarray(se3.inverse(T_world_first) @ T_world_camera)
     stages: list[Stage] = []
     thinned, cell = [np.zeros((0, 3), np.float32)] * len(clouds), 0.0
-    refused = ""
+    refused: list[str] = []
     for voxel in schedule.voxels:
+        name = _name(voxel)
         wanted = max(schedule.thinned, voxel / schedule.points_across)
         if wanted != cell:
             with watch("thin"):
                 thinned, cell = [_thinned(c, wanted) for c in clouds], wanted
-        count = sum(len(c) for c in thinned)
         with watch("planes"):
             planes = find_planes(thinned, T, replace(schedule.search, size=voxel))
-        share = planes.points / max(count, 1)
         if not (planes.per_frame >= schedule.least_planes).any():
-            refused = (
-                f"voxels of {1e3 * voxel:.3g} mm: no frame sees {schedule.least_planes} planes"
-            )
+            refused.append(f"{name}: no frame sees {schedule.least_planes} planes")
+            continue
+        share, before = _share(planes, thinned), stages[-1].share if stages else 0.0
+        if share < schedule.least_share * before:
+            refused.append(f"{name}: {share:.1%} of the points on planes, {before:.1%} before")
             break
-        if stages and share < schedule.least_share * stages[-1].share:
-            refused = (
-                f"voxels of {1e3 * voxel:.3g} mm: {100 * share:.2g} % of the points on planes, "
-                f"{100 * stages[-1].share:.2g} % before"
-            )
-            break
-        T, stage = _settle(thinned, T, planes, voxel, schedule, watch, say)
+        moved, stage = _settle(thinned, T, planes, voxel, schedule, watch, say)
+        far = displacement(planes, T, moved)
+        if far.max() > schedule.farthest * voxel:
+            refused.append(f"{name}: lead frame {far.argmax()} away, by {far.max():.3g} m")
+            continue
         stages.append(stage)
+        T = moved
     if not stages:
-        raise MethodError(refused or "no voxels were asked for")
-    return Registered(T_world_first @ T, tuple(stages), refused)
+        raise MethodError("; ".join(refused) or "no voxels were asked for")
+    return Registered(T_world_first @ T, tuple(stages), tuple(refused))
 
 
 def _settle(
@@ -149,7 +153,7 @@ def _settle(
     solver = replace(schedule.solver, reach=schedule.reach * voxel)
     iterations, rounds = 0, 0
     while True:
-        say(f"voxels of {1e3 * voxel:.3g} mm, round {rounds + 1}, {len(planes)} planes")
+        say(f"{_name(voxel)}, round {rounds + 1}, {len(planes)} planes")
         moves = planes.per_frame >= schedule.least_planes
         with watch("solve"):
             solution = solve(planes, T, solver, moves)
@@ -165,8 +169,17 @@ def _settle(
             break
         planes = again
     held = tuple(int(k) for k in np.flatnonzero(planes.per_frame < schedule.least_planes))
-    share = planes.points / max(sum(len(c) for c in clouds), 1)
+    share = _share(planes, clouds)
     return T, Stage(voxel, rounds, iterations, len(planes), share, solution.cost, held)
+
+
+def _share(planes: Planes, clouds: Sequence[Cloud]) -> float:
+    """Return the part of all points that lie on planes."""
+    return planes.points / max(sum(len(c) for c in clouds), 1)
+
+
+def _name(voxel: float) -> str:
+    return f"voxels of {1e3 * voxel:.3g} mm"
 
 
 def _thinned(points: NDArray[np.floating], cell: float) -> Cloud:

@@ -127,11 +127,7 @@ def _leaves(
     if not len(points):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4))
     root, octant = _locate(points, frame, np.ascontiguousarray(T_world_camera), size, layers)
-    root -= root.min(axis=1, keepdims=True)
-    extent = root.max(axis=1) + 1
-    number = (root[0] * extent[1] + root[1]) * extent[2] + root[2]
-    if float(np.prod(extent.astype(float))) * 8.0 ** (layers - 1) * len(clouds) > 2.0**62:
-        raise OptionError(f"voxel size {size} m: too small for a scene of {extent} voxels")
+    number = _numbered(root, room=2.0**62 / (8.0 ** (layers - 1) * len(clouds)))
     key = ((number << (3 * (layers - 1))) | octant) * len(clouds) + frame
     # neighbours in a cloud mostly share a leaf: only where the leaf changes is there what to sort
     begins = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
@@ -139,6 +135,18 @@ def _leaves(
     slot = np.repeat(slot, np.diff(begins, append=len(key)))
     leaf, leaf_frame = np.divmod(keys, len(clouds))
     return leaf, leaf_frame, cluster_points(points, slot, len(keys))
+
+
+def _numbered(root: Ints, room: float) -> Ints:
+    """Number voxels (3, n) by x, then y, then z, below ``room``."""
+    root = root - root.min(axis=1, keepdims=True)
+    if np.prod(root.max(axis=1) + 1.0) > room:
+        # frames that flew off leave most coordinates empty
+        root = np.stack([np.unique(axis, return_inverse=True)[1] for axis in root])
+    extent = root.max(axis=1) + 1
+    if np.prod(extent.astype(float)) > room:
+        raise OptionError(f"voxels are too small: {' x '.join(map(str, extent))} are too many")
+    return np.asarray((root[0] * extent[1] + root[1]) * extent[2] + root[2])
 
 
 @nb.njit(cache=True, nogil=True)
