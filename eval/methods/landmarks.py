@@ -24,6 +24,10 @@ from depthba import se3
 from eval.methods.tracks import Floats, Tracks
 
 
+STILL = 1e-10
+"""Steps below this, m and rad, are none."""
+
+
 @dataclass(frozen=True)
 class LandmarkOptions:
     """The loss and the schedule."""
@@ -175,14 +179,14 @@ def adjust(tracks: Tracks, T_start: Floats, options: LandmarkOptions) -> Landmar
             continue
         moved, shifted = se3.retract(T, delta), landmarks + shift
         after = cost(residuals(tracks, moved, shifted), options.huber)
+        still = max(np.abs(delta).max(), np.abs(shift).max()) < STILL
+        # a rise too small to tell from rounding is the end, too
+        converged = bool(still or abs(now - after) <= options.tolerance * now)
         if after <= now:
-            converged = now - after <= options.tolerance * now
             T, landmarks, now = moved, shifted, after
             damping = max(damping / 10, 1e-12)
             lin = linearise(tracks, T, landmarks, options.huber)
         else:
-            # steps too small to tell rounding from a rise are the end, too
-            converged = after - now <= options.tolerance * now
             damping *= 10
     return LandmarkSolution(T, landmarks, now, done, converged)
 

@@ -40,7 +40,7 @@ class Balm2CoarseToFine:
     """As well as it goes: voxels halve, and in each size planes are found until the poses settle.
 
     Beyond the paper, too, a solution may not lead points away from where their planes were found,
-    by more than a quarter of a voxel, nor all solutions of one size by more than a whole one. A size
+    by more than a quarter of a voxel, nor those of one size together by a whole one. A size
     at which most planes are lost, because it shows noise, is left out.
     """
 

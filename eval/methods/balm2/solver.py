@@ -67,12 +67,13 @@ def solve(
         planes: frozen.
         T_world_camera: (N, 4, 4), the start.
         options: of the solver.
-        moves: (N,) frames that move; None: all. The others stay, their points count. If the first
-            one stays, nothing is re-expressed.
+        moves: (N,) frames that move; None: all. The others stay, and their points count for
+            nothing. If the first one stays, nothing is re-expressed.
 
     """
     moves = np.ones(planes.frames, dtype=bool) if moves is None else moves
     free = np.repeat(moves, 6)
+    planes = planes.only(moves)
     T, damping, growth = T_world_camera, options.damping, options.growth
     trials: list[Trial] = []
     here = linearise(planes, T)
@@ -106,7 +107,7 @@ def solve(
             if near and abs(change) < options.tolerance:
                 break
     if moves[0]:
-        T = se3.align_first(T, T_world_camera)
+        T = np.where(moves[:, None, None], se3.align_first(T, T_world_camera), T)
     return Solution(T, now, tuple(trials))
 
 

@@ -76,6 +76,13 @@ class Planes:
         """(N,), how many features each frame sees."""
         return np.bincount(self.frame, minlength=self.frames)
 
+    def only(self, frames: NDArray[np.bool_]) -> Planes:
+        """Return what some of the frames (N,) see; planes that none of them sees are gone."""
+        keep = frames[self.frame]
+        _, first, feature = np.unique(self.feature[keep], return_index=True, return_inverse=True)
+        layer = self.layer[self.feature[keep][first]]
+        return Planes(self.frames, self.clusters[keep], self.frame[keep], feature, layer)
+
     @property
     def points(self) -> int:
         """How many points lie on planes."""
