@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from depthba import se3
 from eval.methods.tracks import Floats, Tracks
 
-
 STILL = 1e-10
 """Steps below this, m and rad, are none."""
 
