@@ -13,6 +13,11 @@ from eval.methods.balm2.cost import cost, linearise, retract
 from eval.methods.balm2.voxels import Planes
 
 
+FARTHER = 4.0
+"""What a step out of reach multiplies the damping by. That bends the step away from where frames
+are hardly held, which shortening it would not."""
+
+
 @dataclass(frozen=True)
 class SolverOptions:
     """The schedule of the damping, and when to stop."""
@@ -101,10 +106,12 @@ def solve(
             if abs(change) < options.tolerance:
                 break
             here = linearise(planes, T)
+        elif not near:
+            damping *= FARTHER
         else:
             damping *= growth
             growth *= 2.0
-            if near and abs(change) < options.tolerance:
+            if abs(change) < options.tolerance:
                 break
     if moves[0]:
         T = np.where(moves[:, None, None], se3.align_first(T, T_world_camera), T)
