@@ -1,0 +1,109 @@
+"""Bundle adjustment on planes, BALM2: as published, and as well as it goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from depthba.errors import OptionError
+from eval.methods.balm2.schedule import Schedule, register
+from eval.methods.method import Estimate, MethodError, Stopwatch, Task
+
+FIXED = 0.18
+"""Voxels of one size have this part of a frame's extent as their edge: 0.1 m, the paper's default,
+where a frame sees 0.65 m by 0.49 m."""
+COARSEST = 0.29
+"""Of a frame's extent. At 0.5 frames that stand a centimetre off fall onto each other."""
+FINEST = 8.0
+"""In point spacings. Of a plane's 15 points a leaf, an eighth of a root as to area, must get some
+from each frame."""
+
+
+@dataclass(frozen=True)
+class Balm2:
+    """As published: planes found once, in voxels of one size, at the start poses."""
+
+    voxel: float | None = None
+    """Edge of the root voxels, m; None: 0.18 of a frame's extent, the root of the area it sees."""
+    thinned: float | None = None
+    """Edge of the cubes that frames are thinned by, m; None: 1.5 point spacings."""
+
+    def run(self, task: Task) -> Estimate:
+        """Register the frames from the start poses."""
+        voxel = FIXED * frame_extent(task) if self.voxel is None else self.voxel
+        return _run(task, Schedule((voxel,), _thinned(task, self.thinned, 1.5)))
+
+
+@dataclass(frozen=True)
+class Balm2CoarseToFine:
+    """As well as it goes: voxels halve, and in each size planes are found until the poses settle.
+
+    Beyond the paper, too, a solution may not lead points away from where their planes were found,
+    by more than a quarter of a voxel, nor those of one size together by a whole one. A size
+    at which most planes are lost, because it shows noise, is left out.
+    """
+
+    coarsest: float | None = None
+    """Edge of the first root voxels, m; None: 0.29 of a frame's extent."""
+    finest: float | None = None
+    """No voxel is smaller, m; None: 8 point spacings."""
+    thinned: float | None = None
+    """Edge of the cubes that frames are thinned by, m, or more, a fortieth of the voxels; None: the
+    point spacing."""
+    rounds: int = 15
+    """How often planes are found in one size, at most."""
+
+    def run(self, task: Task) -> Estimate:
+        """Register the frames from the start poses."""
+        coarsest = COARSEST * frame_extent(task) if self.coarsest is None else self.coarsest
+        finest = FINEST * task.spacing if self.finest is None else self.finest
+        schedule = Schedule(
+            voxels=halvings(coarsest, finest),
+            thinned=_thinned(task, self.thinned, 1.0),
+            points_across=40.0,
+            rounds=self.rounds,
+            least_share=0.25,
+            reach=0.25,
+            farthest=1.0,
+        )
+        return _run(task, schedule)
+
+
+def halvings(coarsest: float, finest: float) -> tuple[float, ...]:
+    """Return sizes that halve, m: from the coarsest one to the last that is not below the finest.
+
+    The coarsest one is there in any case.
+    """
+    if not (0 < coarsest < np.inf and finest > 0):
+        raise OptionError(f"voxels from {coarsest} to {finest} m: must be above 0 and finite")
+    count = max(int(np.floor(np.log2(coarsest / finest) + 1e-9)), 0) + 1
+    return tuple(coarsest / 2.0**k for k in range(count))
+
+
+def frame_extent(task: Task) -> float:
+    """Return the root of the area that a frame sees, m: as many squares of the spacing as points.
+
+    Raises:
+        MethodError: there are no points.
+
+    """
+    counts = [len(points) for points in task.clouds if len(points)]
+    if not counts or not np.isfinite(task.spacing):
+        raise MethodError("no frame has points")
+    return float(task.spacing * np.sqrt(np.median(counts)))
+
+
+def _thinned(task: Task, cell: float | None, spacings: float) -> float:
+    return spacings * task.spacing if cell is None else cell
+
+
+def _run(task: Task, schedule: Schedule) -> Estimate:
+    watch = Stopwatch()
+    found = register(task.clouds, task.T_world_camera, schedule, watch, task.say)
+    notes = []
+    if held := found.stages[-1].held:
+        frames = ", ".join(str(task.dataset[k].id) for k in held)
+        notes.append(f"frames that see too few planes to move: {frames}")
+    last = found.stages[-1]
+    return Estimate(found.T_world_camera, watch.seconds, tuple(notes), last.iterations)
