@@ -24,7 +24,7 @@ def judge(task: Task, estimate: Estimate) -> list[Metric]:
         if estimate.covariance is not None:
             nees = consistency(T, T_true, estimate.covariance).nees_per_dof
             found.append(Metric("nees_per_dof", "1", "one", nees))
-    found += marker_metrics(dataset, aligned)
+    found += marker_metrics(dataset.markers(), dataset.ids, aligned)
     cell = CELL_SPACINGS * task.spacing
     points = [p[np.isfinite(p).all(axis=1)] for p in task.clouds]
     found += agreement(points, aligned, map_rotation(dataset, reference), cell).metrics()

@@ -48,7 +48,8 @@ class TeaserBa:
             raise MethodError("no frame shares three landmarks with the first one")
         with watch("adjust"):
             edges = [Edge(p.target, p.source, p.T_target_source, isotropic(1, 1)) for p in found]
-            T = spanning_tree(task.T_world_camera, edges, [len(p.inliers) for p in found])
+            support = [len(p.inliers) for p in found]
+            T, _ = spanning_tree(task.T_world_camera, edges, support)
             T[~tied] = task.T_world_camera[~tied]
             solution = adjust(tracks, T, LandmarkOptions(huber, self.iterations))
         notes = []

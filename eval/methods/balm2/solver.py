@@ -12,7 +12,6 @@ from eval.methods.balm2.clusters import Floats, join_clusters
 from eval.methods.balm2.cost import cost, linearise, retract
 from eval.methods.balm2.voxels import Planes
 
-
 FARTHER = 4.0
 """What a step out of reach multiplies the damping by. That bends the step away from where frames
 are hardly held, which shortening it would not."""
