@@ -49,6 +49,10 @@ class Schedule:
     """A frame that sees fewer planes stays where it is."""
     search: VoxelOptions = field(default_factory=VoxelOptions)
     """But for the size."""
+    loose: tuple[float, ...] = (1 / 4, 1 / 4, 1 / 4)
+    """Flatness by layer in large voxels, whose pieces of surface are curved."""
+    loose_above: float = float("inf")
+    """Which voxels are large, m."""
     solver: SolverOptions = field(default_factory=SolverOptions)
     """But for the reach."""
     reach: float = float("inf")
@@ -117,9 +121,9 @@ def register(
         wanted = max(schedule.thinned, voxel / schedule.points_across)
         if wanted != cell:
             with watch("thin"):
-                thinned, cell = [_thinned(c, wanted) for c in clouds], wanted
+                thinned, cell = thinned_clouds(clouds, wanted), wanted
         with watch("planes"):
-            planes = find_planes(thinned, T, replace(schedule.search, size=voxel))
+            planes = find_planes(thinned, T, _search(schedule, voxel))
         if not (planes.per_frame >= schedule.least_planes).any():
             refused.append(f"{name}: no frame sees {schedule.least_planes} planes")
             continue
@@ -149,7 +153,7 @@ def _settle(
     say: Callable[[str], None],
 ) -> tuple[Floats, Stage]:
     """Move the frames, and find planes anew, until poses settle."""
-    search = replace(schedule.search, size=voxel)
+    search = _search(schedule, voxel)
     solver = replace(schedule.solver, reach=schedule.reach * voxel)
     iterations, rounds = 0, 0
     while True:
@@ -173,6 +177,22 @@ def _settle(
     return T, Stage(voxel, rounds, iterations, len(planes), share, solution.cost, held)
 
 
+def plane_share(clouds: Sequence[Cloud], T_world_camera: Floats, search: VoxelOptions) -> float:
+    """Return the part of all points that lie on planes, the frames (N, 4, 4) being there."""
+    return _share(find_planes(clouds, T_world_camera, search), clouds)
+
+
+def thinned_clouds(clouds: Sequence[NDArray[np.floating]], cell: float) -> list[Cloud]:
+    """Return the mean point per cube of an edge of ``cell``, m, frame by frame."""
+    return [thin(np.asarray(c, dtype=np.float64), cell).astype(np.float32) for c in clouds]
+
+
+def _search(schedule: Schedule, voxel: float) -> VoxelOptions:
+    if voxel > schedule.loose_above:
+        return replace(schedule.search, size=voxel, flatness=schedule.loose)
+    return replace(schedule.search, size=voxel)
+
+
 def _share(planes: Planes, clouds: Sequence[Cloud]) -> float:
     """Return the part of all points that lie on planes."""
     return planes.points / max(sum(len(c) for c in clouds), 1)
@@ -180,7 +200,3 @@ def _share(planes: Planes, clouds: Sequence[Cloud]) -> float:
 
 def _name(voxel: float) -> str:
     return f"voxels of {1e3 * voxel:.3g} mm"
-
-
-def _thinned(points: NDArray[np.floating], cell: float) -> Cloud:
-    return np.asarray(thin(np.asarray(points, dtype=np.float64), cell), dtype=np.float32)

@@ -12,8 +12,7 @@ from eval.methods.balm2.clusters import Floats, join_clusters
 from eval.methods.balm2.cost import cost, linearise, retract
 from eval.methods.balm2.voxels import Planes
 
-
-FARTHER = 4.0
+FARTHER = 10.0
 """What a step out of reach multiplies the damping by. That bends the step away from where frames
 are hardly held, which shortening it would not."""
 
@@ -89,6 +88,8 @@ def solve(
         try:
             x = -np.linalg.solve(here.H[np.ix_(free, free)] + np.diag(damping * D), J)
         except np.linalg.LinAlgError:
+            break
+        if not np.isfinite(x).all():
             break
         step = np.zeros(len(free))
         step[free] = x
