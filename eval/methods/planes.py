@@ -20,6 +20,8 @@ COARSEST = 0.29
 FINEST = 8.0
 """In point spacings. Of a plane's 15 points a smallest voxel, a quarter as long, must get some from
 each frame."""
+SMALLER = (1 / 2, 3 / 8, 3 / 4)
+"""Of the coarsest voxels, those that further schedules begin with."""
 LOOSE = 15.0
 """In point spacings: voxels above this may look for bent planes; in smaller ones that costs
 accuracy."""
@@ -54,9 +56,9 @@ class Balm2CoarseToFine:
     by more than a quarter of a voxel, nor those of one size together by a whole one. A size at
     which most planes are lost, because it shows noise, is left out.
 
-    Up to four schedules are tried: from voxels that take in bad starts, and from half their size,
-    where relief is strong; with flat planes only, and with bent ones. The one that leaves the most
-    points on planes counts.
+    Up to four schedules are tried: from voxels that take in bad starts, with flat planes only; then
+    with bent ones from smaller voxels, where relief is strong. The one that leaves the most points
+    on planes counts.
     """
 
     coarsest: float | None = None
@@ -83,17 +85,17 @@ class Balm2CoarseToFine:
             least_share=0.25,
             reach=0.25,
             farthest=1.0,
-            solver=SolverOptions(iterations=20),
+            solver=SolverOptions(iterations=20, downhill=True),
         )
         bent = replace(flat, loose_above=LOOSE * task.spacing)
-        smaller = flat.voxels[1:] or flat.voxels
-        schedules = [flat, replace(bent, voxels=smaller), bent, replace(flat, voxels=smaller)]
+        schedules = [flat]
+        schedules += [replace(bent, voxels=halvings(k * coarsest, finest)) for k in SMALLER]
         watch = Stopwatch()
         found = register_best(
             task.clouds,
             task.T_world_camera,
             schedules[: self.attempts],
-            smaller[0],
+            max(coarsest / 2.0, finest),
             ENOUGH,
             watch,
             task.say,

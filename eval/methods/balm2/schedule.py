@@ -124,7 +124,7 @@ def register(
                 thinned, cell = thinned_clouds(clouds, wanted), wanted
         with watch("planes"):
             planes = find_planes(thinned, T, _search(schedule, voxel))
-        if not (planes.per_frame >= schedule.least_planes).any():
+        if not _movable(planes, schedule.least_planes).any():
             refused.append(f"{name}: no frame sees {schedule.least_planes} planes")
             continue
         share, before = _share(planes, thinned), stages[-1].share if stages else 0.0
@@ -158,7 +158,7 @@ def _settle(
     iterations, rounds = 0, 0
     while True:
         say(f"{_name(voxel)}, round {rounds + 1}, {len(planes)} planes")
-        moves = planes.per_frame >= schedule.least_planes
+        moves = _movable(planes, schedule.least_planes)
         with watch("solve"):
             solution = solve(planes, T, solver, moves)
         iterations += len(solution.trials)
@@ -169,12 +169,20 @@ def _settle(
             break
         with watch("planes"):
             again = find_planes(clouds, T, search)
-        if not (again.per_frame >= schedule.least_planes).any():
+        if not _movable(again, schedule.least_planes).any():
             break
         planes = again
-    held = tuple(int(k) for k in np.flatnonzero(planes.per_frame < schedule.least_planes))
+    held = tuple(int(k) for k in np.flatnonzero(~_movable(planes, schedule.least_planes)))
     share = _share(planes, clouds)
     return T, Stage(voxel, rounds, iterations, len(planes), share, solution.cost, held)
+
+
+def _movable(planes: Planes, least: int) -> NDArray[np.bool_]:
+    """Return (N,), the frames that see ``least`` planes together with others that move."""
+    moves = planes.per_frame >= least
+    while not np.array_equal(moves, still := moves & (planes.only(moves).per_frame >= least)):
+        moves = still
+    return moves
 
 
 def plane_share(clouds: Sequence[Cloud], T_world_camera: Floats, search: VoxelOptions) -> float:
