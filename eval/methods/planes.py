@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from depthba.errors import OptionError
-from eval.methods.balm2.schedule import Schedule, register
+from eval.methods.balm2.attempts import register_best
+from eval.methods.balm2.schedule import Registered, Schedule, register
+from eval.methods.balm2.solver import SolverOptions
 from eval.methods.method import Estimate, MethodError, Stopwatch, Task
 
 FIXED = 0.18
@@ -16,8 +18,16 @@ where a frame sees 0.65 m by 0.49 m."""
 COARSEST = 0.29
 """Of a frame's extent. At 0.5 frames that stand a centimetre off fall onto each other."""
 FINEST = 8.0
-"""In point spacings. Of a plane's 15 points a leaf, an eighth of a root as to area, must get some
-from each frame."""
+"""In point spacings. Of a plane's 15 points a smallest voxel, a quarter as long, must get some from
+each frame."""
+SMALLER = (1 / 2, 3 / 8, 3 / 4)
+"""Of the coarsest voxels, those that further schedules begin with."""
+LOOSE = 15.0
+"""In point spacings: voxels above this may look for bent planes; in smaller ones that costs
+accuracy."""
+ENOUGH = 0.8
+"""Share of points on planes that only frames that fit were seen to reach: on relief 0.85 to 0.95,
+where frames were lost 0.2 to 0.5."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +42,10 @@ class Balm2:
     def run(self, task: Task) -> Estimate:
         """Register the frames from the start poses."""
         voxel = FIXED * frame_extent(task) if self.voxel is None else self.voxel
-        return _run(task, Schedule((voxel,), _thinned(task, self.thinned, 1.5)))
+        schedule = Schedule((voxel,), _thinned(task, self.thinned, 1.5))
+        watch = Stopwatch()
+        found = register(task.clouds, task.T_world_camera, schedule, watch, task.say)
+        return _estimate(task, found, watch)
 
 
 @dataclass(frozen=True)
@@ -40,8 +53,12 @@ class Balm2CoarseToFine:
     """As well as it goes: voxels halve, and in each size planes are found until the poses settle.
 
     Beyond the paper, too, a solution may not lead points away from where their planes were found,
-    by more than a quarter of a voxel, nor those of one size together by a whole one. A size
-    at which most planes are lost, because it shows noise, is left out.
+    by more than a quarter of a voxel, nor those of one size together by a whole one. A size at
+    which most planes are lost, because it shows noise, is left out.
+
+    Up to four schedules are tried: from voxels that take in bad starts, with flat planes only; then
+    with bent ones from smaller voxels, where relief is strong. The one that leaves the most points
+    on planes counts.
     """
 
     coarsest: float | None = None
@@ -53,12 +70,14 @@ class Balm2CoarseToFine:
     point spacing."""
     rounds: int = 15
     """How often planes are found in one size, at most."""
+    attempts: int = 4
+    """How many schedules are tried, at most."""
 
     def run(self, task: Task) -> Estimate:
         """Register the frames from the start poses."""
         coarsest = COARSEST * frame_extent(task) if self.coarsest is None else self.coarsest
         finest = FINEST * task.spacing if self.finest is None else self.finest
-        schedule = Schedule(
+        flat = Schedule(
             voxels=halvings(coarsest, finest),
             thinned=_thinned(task, self.thinned, 1.0),
             points_across=40.0,
@@ -66,8 +85,22 @@ class Balm2CoarseToFine:
             least_share=0.25,
             reach=0.25,
             farthest=1.0,
+            solver=SolverOptions(iterations=20, downhill=True),
         )
-        return _run(task, schedule)
+        bent = replace(flat, loose_above=LOOSE * task.spacing)
+        schedules = [flat]
+        schedules += [replace(bent, voxels=halvings(k * coarsest, finest)) for k in SMALLER]
+        watch = Stopwatch()
+        found = register_best(
+            task.clouds,
+            task.T_world_camera,
+            schedules[: self.attempts],
+            max(coarsest / 2.0, finest),
+            ENOUGH,
+            watch,
+            task.say,
+        )
+        return _estimate(task, found, watch)
 
 
 def halvings(coarsest: float, finest: float) -> tuple[float, ...]:
@@ -98,9 +131,7 @@ def _thinned(task: Task, cell: float | None, spacings: float) -> float:
     return spacings * task.spacing if cell is None else cell
 
 
-def _run(task: Task, schedule: Schedule) -> Estimate:
-    watch = Stopwatch()
-    found = register(task.clouds, task.T_world_camera, schedule, watch, task.say)
+def _estimate(task: Task, found: Registered, watch: Stopwatch) -> Estimate:
     notes = []
     if held := found.stages[-1].held:
         frames = ", ".join(str(task.dataset[k].id) for k in held)

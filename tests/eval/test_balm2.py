@@ -93,7 +93,14 @@ def perturbed(T: Floats, sigma_t: float, sigma_r: float, seed: int) -> Floats:
     return se3.retract(T, off)
 
 
-FINE = {"points_across": 40.0, "rounds": 15, "least_share": 0.25, "reach": 0.25, "farthest": 1.0}
+FINE = {
+    "points_across": 40.0,
+    "rounds": 15,
+    "least_share": 0.25,
+    "reach": 0.25,
+    "farthest": 1.0,
+    "solver": SolverOptions(iterations=20, downhill=True),
+}
 
 
 def test_fixed_voxel_on_the_rough_scene_is_as_good_as_the_reference() -> None:
@@ -117,6 +124,7 @@ def test_coarse_to_fine_on_the_rough_scene_is_as_good_as_the_reference() -> None
     assert np.all(errors(registered.T_world_camera, T_true) < 1.5 * np.array([0.07, 0.11]))
 
 
+@pytest.mark.slow
 def test_coarse_to_fine_on_the_noisy_scene_stops_before_it_fits_noise() -> None:
     clouds, T_true = scene("s1")
     T = perturbed(T_true, 0.02, 0.03, 0)
@@ -258,6 +266,17 @@ def test_the_reach_bounds_every_solution() -> None:
     # frames are expressed relative to the first one afterwards, which adds its motion to theirs
     assert displacement(planes, T, bound.T_world_camera).max() < 0.011
     assert bound.cost < cost(planes, T)
+
+
+def test_downhill_steps_lower_the_cost_where_the_hessian_is_not_definite() -> None:
+    clouds, T_true = room(4, 0.0005)
+    T = perturbed(T_true, 0.05, 0.1, 2)
+    planes = find_planes([thin(c, 0.005).astype(np.float32) for c in clouds], T, VoxelOptions(0.5))
+    start = linearise(planes, T)
+    assert np.linalg.eigvalsh(start.H)[0] < -1e-3 * np.abs(start.H).max()
+    downhill = solve(planes, T, SolverOptions(downhill=True))
+    assert downhill.trials[0].after < downhill.trials[0].before
+    assert downhill.cost < 0.5 * start.cost
 
 
 def test_voxels_that_make_no_sense_are_refused() -> None:

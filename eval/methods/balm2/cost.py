@@ -102,7 +102,9 @@ def linearise(planes: Planes, T_world_camera: Floats) -> Quadratic:
         lq, length = along(other)
         columns[:, k, :3] = np.cross(lq, u) + np.cross(eq, other)
         columns[:, k, 3:] = length[:, None] * u + e[:, None] * other
-        weights[:, k] = 2.0 / (N * (values[:, 0] - values[:, k]))
+        gap = values[:, 0] - values[:, k]
+        # points on a line have no normal that could turn
+        weights[:, k] = np.divide(2.0, N * gap, out=np.zeros_like(N), where=gap < 0)
 
     J = np.zeros((planes.frames, 6))
     np.add.at(J, planes.frame, J_rows)

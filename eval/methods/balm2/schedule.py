@@ -49,6 +49,10 @@ class Schedule:
     """A frame that sees fewer planes stays where it is."""
     search: VoxelOptions = field(default_factory=VoxelOptions)
     """But for the size."""
+    loose: tuple[float, ...] = (1 / 4, 1 / 4, 1 / 4)
+    """Flatness by layer in large voxels, whose pieces of surface are curved."""
+    loose_above: float = float("inf")
+    """Which voxels are large, m."""
     solver: SolverOptions = field(default_factory=SolverOptions)
     """But for the reach."""
     reach: float = float("inf")
@@ -117,10 +121,10 @@ def register(
         wanted = max(schedule.thinned, voxel / schedule.points_across)
         if wanted != cell:
             with watch("thin"):
-                thinned, cell = [_thinned(c, wanted) for c in clouds], wanted
+                thinned, cell = thinned_clouds(clouds, wanted), wanted
         with watch("planes"):
-            planes = find_planes(thinned, T, replace(schedule.search, size=voxel))
-        if not (planes.per_frame >= schedule.least_planes).any():
+            planes = find_planes(thinned, T, _search(schedule, voxel))
+        if not _movable(planes, schedule.least_planes).any():
             refused.append(f"{name}: no frame sees {schedule.least_planes} planes")
             continue
         share, before = _share(planes, thinned), stages[-1].share if stages else 0.0
@@ -149,12 +153,12 @@ def _settle(
     say: Callable[[str], None],
 ) -> tuple[Floats, Stage]:
     """Move the frames, and find planes anew, until poses settle."""
-    search = replace(schedule.search, size=voxel)
+    search = _search(schedule, voxel)
     solver = replace(schedule.solver, reach=schedule.reach * voxel)
     iterations, rounds = 0, 0
     while True:
         say(f"{_name(voxel)}, round {rounds + 1}, {len(planes)} planes")
-        moves = planes.per_frame >= schedule.least_planes
+        moves = _movable(planes, schedule.least_planes)
         with watch("solve"):
             solution = solve(planes, T, solver, moves)
         iterations += len(solution.trials)
@@ -165,12 +169,36 @@ def _settle(
             break
         with watch("planes"):
             again = find_planes(clouds, T, search)
-        if not (again.per_frame >= schedule.least_planes).any():
+        if not _movable(again, schedule.least_planes).any():
             break
         planes = again
-    held = tuple(int(k) for k in np.flatnonzero(planes.per_frame < schedule.least_planes))
+    held = tuple(int(k) for k in np.flatnonzero(~_movable(planes, schedule.least_planes)))
     share = _share(planes, clouds)
     return T, Stage(voxel, rounds, iterations, len(planes), share, solution.cost, held)
+
+
+def _movable(planes: Planes, least: int) -> NDArray[np.bool_]:
+    """Return (N,), the frames that see ``least`` planes together with others that move."""
+    moves = planes.per_frame >= least
+    while not np.array_equal(moves, still := moves & (planes.only(moves).per_frame >= least)):
+        moves = still
+    return moves
+
+
+def plane_share(clouds: Sequence[Cloud], T_world_camera: Floats, search: VoxelOptions) -> float:
+    """Return the part of all points that lie on planes, the frames (N, 4, 4) being there."""
+    return _share(find_planes(clouds, T_world_camera, search), clouds)
+
+
+def thinned_clouds(clouds: Sequence[NDArray[np.floating]], cell: float) -> list[Cloud]:
+    """Return the mean point per cube of an edge of ``cell``, m, frame by frame."""
+    return [thin(np.asarray(c, dtype=np.float64), cell).astype(np.float32) for c in clouds]
+
+
+def _search(schedule: Schedule, voxel: float) -> VoxelOptions:
+    if voxel > schedule.loose_above:
+        return replace(schedule.search, size=voxel, flatness=schedule.loose)
+    return replace(schedule.search, size=voxel)
 
 
 def _share(planes: Planes, clouds: Sequence[Cloud]) -> float:
@@ -180,7 +208,3 @@ def _share(planes: Planes, clouds: Sequence[Cloud]) -> float:
 
 def _name(voxel: float) -> str:
     return f"voxels of {1e3 * voxel:.3g} mm"
-
-
-def _thinned(points: NDArray[np.floating], cell: float) -> Cloud:
-    return np.asarray(thin(np.asarray(points, dtype=np.float64), cell), dtype=np.float32)

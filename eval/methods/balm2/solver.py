@@ -12,7 +12,7 @@ from eval.methods.balm2.clusters import Floats, join_clusters
 from eval.methods.balm2.cost import cost, linearise, retract
 from eval.methods.balm2.voxels import Planes
 
-FARTHER = 4.0
+FARTHER = 10.0
 """What a step out of reach multiplies the damping by. That bends the step away from where frames
 are hardly held, which shortening it would not."""
 
@@ -29,6 +29,9 @@ class SolverOptions:
     """At most, turned-down steps included."""
     tolerance: float = 1e-6
     """Relative change of the cost at which to stop."""
+    downhill: bool = False
+    """Whether curvature counts by its magnitude, so that steps lead down where the Hessian is not
+    definite, far from the optimum. The paper takes it as it is."""
     reach: float = float("inf")
     """Farthest that a frame's points may go from where their planes were found, root mean square,
     m: steps beyond are turned down. The paper has no such bound."""
@@ -80,14 +83,14 @@ def solve(
     planes = planes.only(moves)
     T, damping, growth = T_world_camera, options.damping, options.growth
     trials: list[Trial] = []
-    here = linearise(planes, T)
-    now = here.cost
+    now, J, H = _system(planes, T, free, options.downhill)
     for _ in range(options.iterations):
-        D = np.diag(here.H)[free]
-        J = here.J[free]
+        D = np.diag(H)
         try:
-            x = -np.linalg.solve(here.H[np.ix_(free, free)] + np.diag(damping * D), J)
+            x = -np.linalg.solve(H + np.diag(damping * D), J)
         except np.linalg.LinAlgError:
+            break
+        if not np.isfinite(x).all():
             break
         step = np.zeros(len(free))
         step[free] = x
@@ -104,7 +107,7 @@ def solve(
             T, now = moved, after
             if abs(change) < options.tolerance:
                 break
-            here = linearise(planes, T)
+            _, J, H = _system(planes, T, free, options.downhill)
         elif not near:
             damping *= FARTHER
         else:
@@ -115,6 +118,18 @@ def solve(
     if moves[0]:
         T = np.where(moves[:, None, None], se3.align_first(T, T_world_camera), T)
     return Solution(T, now, tuple(trials))
+
+
+def _system(
+    planes: Planes, T_world_camera: Floats, free: NDArray[np.bool_], downhill: bool
+) -> tuple[float, Floats, Floats]:
+    """Return the cost, m², and its derivatives in what is free, of first and second order."""
+    here = linearise(planes, T_world_camera)
+    H = here.H[np.ix_(free, free)]
+    if downhill:
+        values, axes = np.linalg.eigh(H)
+        H = (axes * np.abs(values)) @ axes.T
+    return here.cost, here.J[free], H
 
 
 def displacement(planes: Planes, T_a: Floats, T_b: Floats) -> Floats:

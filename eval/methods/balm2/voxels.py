@@ -77,8 +77,9 @@ class Planes:
         return np.bincount(self.frame, minlength=self.frames)
 
     def only(self, frames: NDArray[np.bool_]) -> Planes:
-        """Return what some of the frames (N,) see; planes that none of them sees are gone."""
+        """Return what some of the frames (N,) see of planes that two of them see or more."""
         keep = frames[self.frame]
+        keep &= (np.bincount(self.feature[keep], minlength=len(self)) >= 2)[self.feature]
         _, first, feature = np.unique(self.feature[keep], return_index=True, return_inverse=True)
         layer = self.layer[self.feature[keep][first]]
         return Planes(self.frames, self.clusters[keep], self.frame[keep], feature, layer)
