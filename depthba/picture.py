@@ -29,7 +29,7 @@ CELL_SPACINGS = 4.0
 """Width of a cell in point spacings: enough points for a mean, small enough for slopes."""
 EMPTY, DARK = "#e9e9ec", "#121212"
 SPREADS = "inferno_r"
-SIGMAS = "viridis"
+SIGMAS = "YlOrRd"
 HEIGHTS = (
     (66, 104, 138),
     (104, 158, 160),

@@ -23,6 +23,8 @@ LARGEST = 0.9
 """Ellipsoids are drawn no larger than that share: they would hide all else."""
 ARROW = 0.8
 """Length of a unit direction's arrow, as a share of the distance between cameras."""
+NO_SIGMA = 1e-9
+"""m; a centre with less is fixed, and has no ellipsoid."""
 LEAST_PART = 0.2
 """Parts of a direction, of unit length, that are shorter are not drawn."""
 MOVE, TURN, TOO_LARGE = (255, 120, 40), (235, 80, 235), (255, 60, 60)
@@ -97,16 +99,16 @@ def _ellipsoids(
     """Record one standard deviation of the centres, enlarged; return by how much, and those cut."""
     n = len(centres)
     blocks = covariance.reshape(n, 6, n, 6)[np.arange(n), :3, np.arange(n), :3]
-    usable = np.isfinite(blocks).all(axis=(1, 2))
+    usable = np.asarray(np.isfinite(blocks).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(usable[:, None, None], blocks, 0.0))
     sigmas = np.sqrt(np.maximum(values, 0.0))
-    longest = sigmas[:, -1]
-    free = longest > 0
-    if not free.any():
+    longest: Floats = sigmas[:, -1]
+    free = np.flatnonzero(longest > NO_SIGMA)
+    if not len(free):
         return 0.0, 0
     factor = round_factor(ELLIPSOID * apart / float(np.median(longest[free])))
     half = factor * sigmas[free]
-    too_large = half[:, -1] > LARGEST * apart
+    too_large = np.flatnonzero(half[:, -1] > LARGEST * apart)
     half = np.minimum(half, LARGEST * apart)
     half = np.maximum(half, 0.05 * half[:, -1:])  # a disc without thickness is not seen
     turns = vectors[free]
@@ -114,8 +116,7 @@ def _ellipsoids(
     tints = colours[free].copy()
     tints[too_large] = TOO_LARGE
     labels = [
-        f"frame {i}: {' × '.join(f'{1e3 * s:.3g}' for s in sigmas[i, ::-1])} mm"
-        for i in np.flatnonzero(free)
+        f"frame {i}: {' × '.join(f'{1e3 * s:.3g}' for s in sigmas[i, ::-1])} mm" for i in free
     ]
     shown = rr.Ellipsoids3D(
         centers=centres[free],
@@ -127,7 +128,7 @@ def _ellipsoids(
         show_labels=False,
     )
     rec.log("certainty/ellipsoids", shown, static=True)
-    return factor, int(too_large.sum())
+    return factor, len(too_large)
 
 
 def _arrows(rec: rr.RecordingStream, result: Result, apart: float) -> int:

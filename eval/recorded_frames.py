@@ -18,6 +18,8 @@ Colour = Sequence[int] | NDArray[np.uint8]
 
 CLOUD_POINTS = 160_000
 """Points of all frames together, 12 bytes each."""
+COVER = 0.7
+"""Radius of a point by the distance to the next: they must cover what is seen at a slant."""
 FRUSTUM = 0.12
 """Length of a frustum, as a share of the distance that the frame sees."""
 
@@ -60,20 +62,28 @@ def shown_clouds(
     shown = []
     for cloud, T in zip(clouds, T_map_camera, strict=True):
         p = cloud.points[inside(transform(T, cloud.points), roi)]
-        shown.append(ShownCloud(rng.permutation(p), 0.55 * spacing).first(share))
+        shown.append(ShownCloud(rng.permutation(p), COVER * spacing).first(share))
     return tuple(shown)
 
 
-def log_cloud(rec: rr.RecordingStream, path: str, cloud: ShownCloud, colour: Colour) -> None:
-    """Record points once and for all, in one colour."""
+def log_cloud(
+    rec: rr.RecordingStream, path: str, cloud: ShownCloud, colour: Colour, *, static: bool = True
+) -> None:
+    """Record points in one colour or one each, once and for all or at the present time."""
     shown = rr.Points3D(cloud.points.astype(np.float32), colors=colour, radii=cloud.radius)
-    rec.log(path, shown, static=True)
+    rec.log(path, shown, static=static)
 
 
 def log_frustum(
-    rec: rr.RecordingStream, path: str, camera: Camera | None, points: Floats, colour: Colour
+    rec: rr.RecordingStream,
+    path: str,
+    camera: Camera | None,
+    points: Floats,
+    colour: Colour,
+    *,
+    static: bool = True,
 ) -> None:
-    """Record, once and for all, what a camera sees as a small frustum; nothing without a camera."""
+    """Record what a camera sees as a small frustum; nothing without a camera."""
     if camera is None:
         return
     pinhole = rr.Pinhole(
@@ -83,7 +93,7 @@ def log_frustum(
         image_plane_distance=FRUSTUM * (float(np.median(points[:, 2])) if len(points) else 1.0),
         color=colour,
     )
-    rec.log(path, pinhole, static=True)
+    rec.log(path, pinhole, static=static)
 
 
 def log_pose(rec: rr.RecordingStream, path: str, T: Floats, *, static: bool = False) -> None:

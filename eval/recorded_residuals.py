@@ -149,4 +149,4 @@ def histogram(frame: int, r: Floats, full: float) -> tuple[Floats, Floats, float
     counts = np.histogram(np.clip(r, -full, full), BINS, (-full, full))[0]
     width = SLOT / BINS
     places = frame - 0.5 * SLOT + width * (np.arange(BINS) + 0.5)
-    return places, 100.0 * counts / max(len(r), 1), width
+    return np.asarray(places), 100.0 * counts / max(len(r), 1), width

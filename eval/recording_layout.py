@@ -21,7 +21,7 @@ TAN_HALF_VIEW = 0.55
 
 ABREAST = 4
 """Runs that are compared in columns; more are too narrow."""
-BY_RESIDUAL = "BY RESIDUAL: blue below the map, red above, full at 3 σ"
+BY_RESIDUAL = "By residual: blue below, red above"
 
 
 def frame_colours(count: int) -> NDArray[np.uint8]:
@@ -81,6 +81,7 @@ def blueprint(
                 ["/certainty/surface", "/certainty/ellipsoids", "/certainty/open"],
                 depth_map,
                 centres,
+                wide=1.3,
             ),
             above("Uncertain cells", "/certainty/picture"),
             active_tab=0,
@@ -90,12 +91,12 @@ def blueprint(
     told = rrb.Vertical(
         rrb.TextDocumentView(origin="/figures", name="Figures"),
         rrb.Tabs(
-            scene("Map", ["/map/surface"], depth_map, nobody, wide=1.6),
+            scene("Map", ["/map/surface"], depth_map, nobody, wide=1.9),
             above("Map from above", "/map/picture"),
             active_tab=0,
         ),
         _residual_tabs(truth),
-        row_shares=[5, 3, 4],
+        row_shares=[6, 3, 4],
     )
     return _whole(rrb.Horizontal(before, after, good, told, column_shares=[5, 5, 5, 5]))
 
@@ -157,7 +158,7 @@ def compare_blueprint(
 
     def clouds(k: int, kind: str, name: str) -> rrb.Spatial3DView:
         contents = parts_of(f"/run/{k}/cam", n, kind, "image")
-        return scene(name, contents, depth_map, centres, wide=1.3)
+        return scene(name, contents, depth_map, centres, wide=1.5)
 
     table = rrb.TextDocumentView(origin="/figures", name="Figures")
     if len(labels) <= ABREAST:
@@ -168,13 +169,15 @@ def compare_blueprint(
                     clouds(k, "residual", "by residual"),
                     active_tab=0,
                 ),
-                above("how far the frames disagree", f"/run/{k}/spread"),
-                above("map", f"/run/{k}/picture"),
-                row_shares=[4, 3, 3],
+                rrb.Horizontal(
+                    above("frames disagree by", f"/run/{k}/spread"),
+                    above("map", f"/run/{k}/picture"),
+                ),
+                row_shares=[5, 4],
             )
             for k, label in enumerate(labels)
         ]
-        shares = [3.2, 1.0]
+        shares = [5.0, 1.0]
         return _whole(rrb.Vertical(rrb.Horizontal(*columns), table, row_shares=shares), time=False)
     kinds = rrb.Tabs(
         rrb.Grid(*(clouds(k, "points", x) for k, x in enumerate(labels)), name="Clouds by frame"),
@@ -228,13 +231,13 @@ def _residual_tabs(truth: bool) -> rrb.Tabs:
 
 def _certainty_title(scale: Scale) -> str:
     """Say what is seen, and how many times larger than it is."""
-    title = "CERTAINTY"
+    title = "Certainty"
     if scale.factor:
-        title += f": 1 σ of the cameras, drawn {scale.factor:g} × as large"
+        title += f": σ × {scale.factor:g}"
     if scale.cut:
         title += f" ({scale.cut} red: cut)"
     if scale.open_directions:
-        title += "; arrows: open directions"
+        title += ", arrows: open"
     return title
 
 
@@ -244,7 +247,7 @@ def parts_of(root: str, count: int, *names: str) -> list[str]:
 
 
 def scene(
-    name: str, contents: list[str], depth_map: DepthMap, centres: Floats, wide: float = 1.1
+    name: str, contents: list[str], depth_map: DepthMap, centres: Floats, wide: float = 0.85
 ) -> rrb.Spatial3DView:
     """Return a view from above and in front, from where the map and the cameras are all seen.
 
@@ -277,6 +280,7 @@ def scene(
 
 
 def above(name: str, origin: str) -> rrb.Spatial2DView:
+    """Return a view of the picture recorded at ``origin``."""
     return rrb.Spatial2DView(origin=origin, name=name, contents=["$origin/**"])
 
 
