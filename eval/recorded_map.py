@@ -20,7 +20,7 @@ MESH_NODES = 9_000
 PICTURE_SIDE = 360
 FINAL_SIDE = 1200
 """Largest side of the picture from above, pixels."""
-MESH_BYTES = 9_000_000
+MESH_BYTES = 7_000_000
 """Once the meshes take so much, only the first of each grid and the last are recorded."""
 VISIBLE = 0.002
 """Changes below this share of the map's height range are not recorded again."""

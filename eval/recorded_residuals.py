@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 TOTAL_POINTS = 60_000
 """Points of all frames together that carry a residual."""
-COLOUR_BYTES = 4_000_000
+COLOUR_BYTES = 3_000_000
 """Once the colours take so much, only the last are recorded."""
 SPAN = 3.0
 """Colours and histograms reach so many standard deviations to both sides."""

@@ -55,6 +55,8 @@ MILLI = 1e3
 """Curves are in millimetres and milliradians: their axes can be read."""
 FLUSH_SECONDS = 20.0
 """For what is on its way to a viewer or to the disk."""
+PART_SECONDS = 30.0
+"""After so much time a part of the recording is written."""
 SCALARS = ("cost", "sigma", "step_t", "step_r", "inliers", "spacing")
 
 CURVES: Mapping[str, tuple[str, tuple[int, int, int]]] = {
@@ -239,8 +241,13 @@ class Recorder:
 
 
 def open_stream(path: Path | None, viewer: str | None = None) -> rr.RecordingStream:
-    """Begin a recording into a file, a viewer or both; no times but those that are set."""
-    rec = rr.RecordingStream(APPLICATION)
+    """Begin a recording into a file, a viewer or both; no times but those that are set.
+
+    Without a viewer that waits for it, what comes is put together into few large parts: they are
+    read faster.
+    """
+    parts = rr.ChunkBatcherConfig(flush_tick=PART_SECONDS) if viewer is None else None
+    rec = rr.RecordingStream(APPLICATION, batcher_config=parts)
     rec.set_log_tick_enabled(False)
     rec.set_log_time_enabled(False)
     sinks: list[Any] = [] if path is None else [rr.FileSink(path)]

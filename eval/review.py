@@ -128,7 +128,7 @@ def screenshot(files: Sequence[Path], picture: Path) -> None:
         RunError: the viewer left no picture.
 
     """
-    driver = _software_driver()
+    driver = software_driver()
     with tempfile.TemporaryDirectory(prefix="depthba-") as folder, _screen() as display:
         shot = Path(folder) / "screenshot.png"
         environment = {
@@ -201,7 +201,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
-def _software_driver() -> Path:
+def software_driver() -> Path:
     """Return the description of Mesa's software renderer for Vulkan."""
     for folder in SOFTWARE_DRIVERS:
         for file in sorted(Path(folder).glob("lvp_icd*.json")):

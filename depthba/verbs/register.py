@@ -252,7 +252,8 @@ def _viewer(arguments: Arguments) -> Iterator[Any]:
         live = importlib.import_module("eval.live")
     except ImportError as error:
         raise MissingPackage(
-            f"register --live needs {error.name}, which is not installed: pip install 'depthba[eval]'"
+            f"register --live needs {error.name}, which is not installed: "
+            "pip install 'depthba[eval]'"
         ) from error
     with live.opened(arguments.web) as viewer:
         yield viewer
