@@ -45,7 +45,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 BROWSER_SECONDS = 900.0
 """A busy machine draws a minute for one picture."""
 SETTLE_SECONDS = 12.0
-"""Between two looks at the page; when three are alike all of it has been drawn."""
+"""Between two looks at the page; when both are alike all of it has been drawn."""
 
 
 def main() -> int:
@@ -135,14 +135,13 @@ def browser_shot(file: Path) -> bytes:
         tab.prepare()
         tab.ask("Page.navigate", url=review.page_url(page, data) + "&renderer=webgl")
         deadline = time.monotonic() + BROWSER_SECONDS
-        alike, before = 0, np.zeros((0, 0, 3))
+        before = np.zeros((0, 0, 3))
         while time.monotonic() < deadline:
             time.sleep(SETTLE_SECONDS)
             png = tab.picture()
             now = np.asarray(Image.open(BytesIO(png)).convert("RGB"), dtype=float)
             same = now.shape == before.shape and np.abs(now - before).mean() < 0.1
-            alike = alike + 1 if same and is_drawn(now) else 0
-            if alike == 2:
+            if same and is_drawn(now):
                 return png
             before = now
     raise RunError(f"{file}: the browser had drawn nothing after {BROWSER_SECONDS:.0f} s")
