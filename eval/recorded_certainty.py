@@ -59,11 +59,16 @@ def log_certainty(rec: rr.RecordingStream, result: Result, colours: NDArray[np.u
 
 
 def camera_distance(centres: Floats) -> float:
-    """Return the median distance, m, from a camera centre of (N, 3) to the nearest other one."""
-    if len(centres) < 2:
+    """Return about how far apart cameras are whose centres are (N, 3), m.
+
+    By the third nearest of each, which a pair of shots from one place does not make small.
+    """
+    others = min(3, len(centres) - 1)
+    if others < 1:
         return 1.0
-    distance = float(np.median(cKDTree(centres).query(centres, k=2)[0][:, 1]))
-    return distance if distance > 0 else 1.0
+    distance = float(np.median(cKDTree(centres).query(centres, k=others + 1)[0][:, others]))
+    # on a line the third is twice as far as the next one, on a grid not quite
+    return 0.6 * distance if distance > 0 else 1.0
 
 
 def round_factor(factor: float) -> float:

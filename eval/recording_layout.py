@@ -253,7 +253,7 @@ def scene(
 
     The pane is about ``wide`` times as wide as it is high.
     """
-    vertices = depth_map.vertices().reshape(-1, 3)
+    vertices = depth_map.vertices()[_well_seen(depth_map)].reshape(-1, 3)
     vertices = vertices[np.isfinite(vertices).all(axis=1)]
     if not len(vertices):
         return rrb.Spatial3DView(origin="/", contents=contents, name=name)
@@ -277,6 +277,22 @@ def scene(
             eye_up=up,
         ),
     )
+
+
+def _well_seen(depth_map: DepthMap) -> tuple[slice, slice]:
+    """Return the rows and columns that most points bear on, and as much around as fits a plane.
+
+    What a few rays met far away, such as the floor beside a table, must not make the rest small.
+    """
+    spans = []
+    for axis in (1, 0):
+        share = np.cumsum(depth_map.count.sum(axis=axis, dtype=np.float64))
+        if not len(share) or share[-1] <= 0:
+            return slice(None), slice(None)
+        low, high = np.searchsorted(share / share[-1], (0.1, 0.9))
+        more = 0.15 * (high - low) + 1  # evenly seen ground has an eighth of that beyond either end
+        spans.append(slice(max(int(low - more), 0), int(high + more) + 1))
+    return spans[0], spans[1]
 
 
 def above(name: str, origin: str) -> rrb.Spatial2DView:

@@ -153,7 +153,7 @@ def test_ellipsoids_are_enlarged_by_what_the_title_says(
     batches = chunks(recording, "/certainty/ellipsoids")
     half = np.array(column(batches, "Ellipsoids3D:half_sizes")[0])
     centres = np.array(column(batches, "Ellipsoids3D:centers")[0])
-    # frame 0 is fixed; one standard deviation is 0.1 mm and cameras are 0.2 m apart
+    # frame 0 is fixed; one standard deviation is 0.1 mm; the cameras count as 0.24 m apart
     assert_allclose(centres, result.T_world_camera[1:, :3, 3], atol=1e-6)
     assert_allclose(half, 500 * 1e-4, rtol=1e-5)
     titles = column(
@@ -179,10 +179,10 @@ def test_an_ellipsoid_lies_along_the_covariance(
     half = np.array(column(batches, "Ellipsoids3D:half_sizes")[0])
     q = np.array(column(batches, "Ellipsoids3D:quaternions")[0])
     R = se3.from_quaternion(np.zeros(3), q[0])[:3, :3]
-    # 500: the median frame's 0.1 mm becomes a quarter of the distance of the cameras
+    # 500: the median frame's 0.1 mm becomes a fifth of the distance of the cameras
     drawn = R @ np.diag(half[0] ** 2) @ R.T
     assert_allclose(drawn / 500**2, covariance[6:9, 6:9], atol=2e-10)
-    assert_allclose(half[1], 0.9 * 0.2, rtol=0.01)
+    assert_allclose(half[1], 0.9 * 0.24, rtol=0.01)
     tints = np.array(column(batches, "Ellipsoids3D:colors")[0])
     assert (tints[1] >> 8).item() == 0xFF3C3C
 
