@@ -145,19 +145,19 @@ def browser_shot(file: Path) -> bytes:
         process(browser_command(Path(profile))),
     ):
         wait_for(f"http://{review.LOCAL}:{page}/")
-        tab = Tab(Path(profile))
-        tab.prepare()
-        tab.ask("Page.navigate", url=review.page_url(page, data) + "&renderer=webgl")
-        deadline = time.monotonic() + BROWSER_SECONDS
-        before = np.zeros((0, 0, 3))
-        while time.monotonic() < deadline:
-            time.sleep(SETTLE_SECONDS)
-            png = tab.picture()
-            now = np.asarray(Image.open(BytesIO(png)).convert("RGB"), dtype=float)
-            same = now.shape == before.shape and np.abs(now - before).mean() < 0.1
-            if same and is_drawn(now):
-                return png
-            before = now
+        with first_tab(Path(profile)) as tab:
+            tab.prepare()
+            tab.ask("Page.navigate", url=review.page_url(page, data) + "&renderer=webgl")
+            deadline = time.monotonic() + BROWSER_SECONDS
+            before = np.zeros((0, 0, 3))
+            while time.monotonic() < deadline:
+                time.sleep(SETTLE_SECONDS)
+                png = tab.picture()
+                now = np.asarray(Image.open(BytesIO(png)).convert("RGB"), dtype=float)
+                same = now.shape == before.shape and np.abs(now - before).mean() < 0.1
+                if same and is_drawn(now):
+                    return png
+                before = now
     raise RunError(f"{file}: the browser had drawn nothing after {BROWSER_SECONDS:.0f} s")
 
 
@@ -188,24 +188,31 @@ def browser_command(profile: Path) -> list[str]:
     ]
 
 
+@contextlib.contextmanager
+def first_tab(profile: Path) -> Iterator[Tab]:
+    """Give the page of the browser that uses this profile, once it is up."""
+    from websockets.sync.client import connect
+
+    deadline = time.monotonic() + 60
+    file = profile / "DevToolsActivePort"
+    while not file.exists() or not file.read_text().strip():
+        if time.monotonic() > deadline:
+            raise RunError("the browser did not start within 60 s")
+        time.sleep(0.2)
+    port = int(file.read_text().split()[0])
+    with urllib.request.urlopen(f"http://{review.LOCAL}:{port}/json", timeout=30) as answer:
+        pages = [t for t in json.load(answer) if t["type"] == "page"]
+    url = pages[0]["webSocketDebuggerUrl"]
+    with connect(url, max_size=None, open_timeout=60, ping_interval=None) as socket:
+        yield Tab(socket)
+
+
 class Tab:
     """The one page of a browser, spoken to in the DevTools protocol."""
 
-    def __init__(self, profile: Path) -> None:
-        """Connect to the browser that uses this profile, once it is up."""
-        from websockets.sync.client import connect
-
-        deadline = time.monotonic() + 60
-        file = profile / "DevToolsActivePort"
-        while not file.exists() or not file.read_text().strip():
-            if time.monotonic() > deadline:
-                raise RunError("the browser did not start within 60 s")
-            time.sleep(0.2)
-        port = int(file.read_text().split()[0])
-        with urllib.request.urlopen(f"http://{review.LOCAL}:{port}/json", timeout=30) as answer:
-            pages = [t for t in json.load(answer) if t["type"] == "page"]
-        self._socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None, open_timeout=60)
-        self._count = 0
+    def __init__(self, socket: Any) -> None:
+        """Take a connection to the page."""
+        self._socket, self._count = socket, 0
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Return the browser's answer."""

@@ -76,7 +76,7 @@ class Viewer:
         )
         try:
             for port in (data,) if page is None else (data, page):
-                _await(process, port)
+                await_port(process, port)
         except BaseException:
             review.end(process)
             raise
@@ -87,9 +87,12 @@ class Viewer:
         if self.page is None:
             return
         print(f"still shown at {self.page}\nCtrl-C ends it.", file=sys.stderr, flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
+        try:
             self._process.wait()
-        self.close()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.close()
 
     def close(self) -> None:
         """End it."""
@@ -98,15 +101,19 @@ class Viewer:
 
 @contextlib.contextmanager
 def opened(web: bool = False) -> Iterator[Viewer]:
-    """Give a viewer; what fails within ends it, otherwise a window is left to the user."""
-    view = Viewer.open(web)
-    if view.page is not None:
-        print(f"live at {view.page}", file=sys.stderr, flush=True)
-    try:
-        yield view
-    except BaseException:
-        view.close()
-        raise
+    """Give a viewer; what fails within ends it, otherwise it is left as `Viewer.stay` leaves it.
+
+    Where nobody calls that, a page is served until `Viewer.close`.
+    """
+    with review.terminated_cleanly():
+        view = Viewer.open(web)
+        if view.page is not None:
+            print(f"live at {view.page}", file=sys.stderr, flush=True)
+        try:
+            yield view
+        except BaseException:
+            view.close()
+            raise
 
 
 class CaptureLog:
@@ -250,8 +257,13 @@ def _smaller(image: NDArray, interpolation: int) -> NDArray:
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation)
 
 
-def _await(process: subprocess.Popen[bytes], port: int) -> None:
-    """Wait until the viewer listens."""
+def await_port(process: subprocess.Popen[bytes], port: int) -> None:
+    """Wait until a viewer listens.
+
+    Raises:
+        RunError: it ended, or did not answer in time.
+
+    """
     deadline = time.monotonic() + START_SECONDS
     while True:
         with contextlib.suppress(OSError), socket.create_connection((review.LOCAL, port), 1.0):

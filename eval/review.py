@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -173,21 +174,33 @@ def _command() -> list[str]:
 
 def _run(command: Sequence[str]) -> None:
     """Run the viewer until it ends, the user interrupts or somebody ends this process."""
-
-    def leave(number: int, _: object) -> None:
-        raise SystemExit(128 + number)  # so that the viewer is ended below, and not orphaned
-
-    before = signal.signal(signal.SIGTERM, leave)
-    process = subprocess.Popen(command, env={"RUST_LOG": "warn", **os.environ})
-    try:
-        status = process.wait()
-    except KeyboardInterrupt:
-        return
-    finally:
-        end(process)
-        signal.signal(signal.SIGTERM, before)
+    with terminated_cleanly():
+        process = subprocess.Popen(command, env={"RUST_LOG": "warn", **os.environ})
+        try:
+            status = process.wait()
+        except KeyboardInterrupt:
+            return
+        finally:
+            end(process)
     if status:
         raise RunError(f"{command[0]}: the viewer ended with status {status}")
+
+
+@contextlib.contextmanager
+def terminated_cleanly() -> Iterator[None]:
+    """Within, a signal to terminate leaves through all that cleans up, so no viewer is orphaned."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+import sys
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +23,7 @@ from depthba.verbs import register as verb
 from eval import live, review
 from eval.live import CaptureLog
 from eval.recording import Recorder
-from tests.eval.conftest import write_scene
+from tests.eval.conftest import listeners, write_scene
 
 
 class SavingViewer:
@@ -33,7 +36,7 @@ class SavingViewer:
         command = [str(review.viewer()), "--bind", "127.0.0.1", "--port", str(port)]
         environment = {**os.environ, "RUST_LOG": "error"}
         self.process = subprocess.Popen([*command, "--save", str(file)], env=environment)
-        live._await(self.process, port)
+        live.await_port(self.process, port)
 
     def end(self) -> RrdReader:
         review.end(self.process)
@@ -81,6 +84,22 @@ def test_a_viewer_that_is_closed_spoils_nothing(
     ]
     when = [k for b in batches for k in b.column("iteration").to_pylist()]
     assert sorted(when) == list(range(len(result.history) + 2))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/net/tcp")
+def test_a_live_page_is_for_this_machine_alone() -> None:
+    view = live.Viewer.open(web=True)
+    try:
+        assert view.page is not None
+        with urllib.request.urlopen(view.page.partition("?")[0], timeout=30) as page:
+            assert page.status == 200
+        ports = [int(re.findall(r":(\d+)", url)[0]) for url in (view.page, view.address)]
+        assert ports[0] != ports[1]
+        for port in ports:
+            assert listeners(port) == [f"0100007F:{port:04X}"]
+    finally:
+        view.close()
+    assert not [where for port in ports for where in listeners(port)]
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")

@@ -33,7 +33,7 @@ from eval.rebuild import rebuild
 from eval.recording import Recorder
 from eval.recordings_table import find_recordings, read_rows
 from eval.verbs import review as verb
-from tests.eval.conftest import write_scene
+from tests.eval.conftest import listeners, write_scene
 
 
 def test_the_newest_run_opens_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,13 +225,7 @@ def test_the_web_viewer_listens_on_this_machine_alone(recorded: Path) -> None:
             except OSError:
                 assert process.poll() is None and time.monotonic() < deadline
                 time.sleep(0.1)
-        listeners = [
-            row.split()[1]
-            for table in ("tcp", "tcp6")
-            for row in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
-            if row.split()[3] == "0A" and row.split()[1].endswith(f":{port:04X}")
-        ]
-        assert listeners == [f"0100007F:{port:04X}"]
+        assert listeners(port) == [f"0100007F:{port:04X}"]
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(timeout=20)
