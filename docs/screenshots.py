@@ -58,7 +58,10 @@ def main() -> int:
     if missing := missing_packages():
         print(f"screenshots: apt-get install {' '.join(missing)}", file=sys.stderr)
         return 1
-    with tempfile.TemporaryDirectory(prefix="depthba-") as name:
+    with (
+        review.terminated_cleanly(),
+        tempfile.TemporaryDirectory(prefix="depthba-") as name,
+    ):
         folder = Path(name)
         data = generated(SCENE, folder / "data", START_ERROR)
         runs = {preset: registered(data, folder / preset, preset) for preset in PRESETS}

@@ -263,7 +263,7 @@ def scene(
     target = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     # the nearest place on that line from which every point lies within the view's angle
     depth, side, rise = ((seen - target) @ axis for axis in (back, across, np.cross(back, across)))
-    distance = 1.08 * np.max(depth + np.maximum(np.abs(side) / wide, np.abs(rise)) / TAN_HALF_VIEW)
+    distance = 1.12 * np.max(depth + np.maximum(np.abs(side) / wide, np.abs(rise)) / TAN_HALF_VIEW)
     return rrb.Spatial3DView(
         origin="/",
         contents=contents,
@@ -290,7 +290,7 @@ def _well_seen(depth_map: DepthMap) -> tuple[slice, slice]:
         if not len(share) or share[-1] <= 0:
             return slice(None), slice(None)
         low, high = np.searchsorted(share / share[-1], (0.1, 0.9))
-        more = 0.15 * (high - low) + 1  # evenly seen ground has an eighth of that beyond either end
+        more = 0.25 * (high - low) + 1  # of evenly seen ground an eighth lies beyond either end
         spans.append(slice(max(int(low - more), 0), int(high + more) + 1))
     return spans[0], spans[1]
 
