@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/set-up
 
-.PHONY: help setup demo test lint format bench clean
+.PHONY: help setup demo test lint format bench screenshots clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP)  ## system libraries, .venv, pinned packages, depthba itself
 
@@ -33,6 +33,9 @@ format: $(STAMP)  ## let ruff put the code into its form
 
 bench: $(STAMP)  ## the benchmarks
 	@$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+screenshots: $(STAMP)  ## the pictures of the viewer in docs/; needs chromium, xvfb, mesa-vulkan-drivers
+	@$(BIN)/python docs/screenshots.py
 
 clean:  ## remove .venv and what tools left; runs in logs/ stay
 	@rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks build dist

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ CELL_SPACINGS = 4.0
 """Width of a cell in point spacings: enough points for a mean, small enough for slopes."""
 EMPTY, DARK = "#e9e9ec", "#121212"
 SPREADS = "inferno_r"
+SIGMAS = "YlOrRd"
 HEIGHTS = (
     (66, 104, 138),
     (104, 158, 160),
@@ -163,20 +164,46 @@ def before_after(
 
 def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
     """Return the spread alone as PNG for a dark ground, with colours up to ``top`` mm."""
-    from matplotlib import style
+    return _dark_png(
+        _extent(depth_map),
+        lambda ax: _draw_spread(ax, spread, top),
+        "spread between frames (mm)",
+    )
 
-    box = _extent(depth_map)
-    height = float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9.0))
-    with style.context("dark_background"):
-        figure = _figure(7.2, height + 0.6, ground=DARK)
-        ax = figure.subplots()
-        image = _draw_spread(ax, spread, top)
-        _bar(figure, image, [ax], "spread between frames (mm)", extend="max")
-        _frame(ax, box)
-        ax.set_facecolor(DARK)
-        ax.set_xlabel("x (m)")
-        ax.set_ylabel("y (m)")
-        return _png(figure, dpi=100)
+
+def sigma_top(depth_map: DepthMap) -> float:
+    """Return where the colours of a map's standard deviation end, m: nearly all nodes are below."""
+    known = depth_map.sigma[np.isfinite(depth_map.sigma)]
+    return float(np.quantile(known, 0.98)) if len(known) else 1.0
+
+
+def sigma_colours(depth_map: DepthMap, top: float) -> NDArray[np.uint8]:
+    """Return the map as relief, (ny, nx, 3), in the colours of its standard deviation up to top."""
+    from matplotlib import colormaps
+
+    level = np.clip(np.nan_to_num(depth_map.sigma, nan=top) / max(top, 1e-12), 0.0, 1.0)
+    light = np.nan_to_num(shade(depth_map.heights, depth_map.spacing), nan=1.0)[..., None]
+    rgb = 255.0 * colormaps[SIGMAS](level)[..., :3] * light
+    return np.asarray(np.rint(np.clip(rgb, 0.0, 255.0)), dtype=np.uint8)
+
+
+def sigma_png(depth_map: DepthMap) -> bytes:
+    """Return the standard deviation of the heights as PNG for a dark ground, in mm."""
+    ny, nx = depth_map.shape
+    x, y, s = *depth_map.origin, depth_map.spacing
+
+    def draw(ax: Axes) -> Any:
+        return ax.imshow(
+            1e3 * depth_map.sigma,
+            extent=(x - 0.5 * s, x + (nx - 0.5) * s, y - 0.5 * s, y + (ny - 0.5) * s),
+            origin="lower",
+            cmap=SIGMAS,
+            vmin=0.0,
+            vmax=1e3 * sigma_top(depth_map),
+            interpolation="nearest",
+        )
+
+    return _dark_png(_extent(depth_map), draw, "standard deviation of the height (mm)")
 
 
 def height_colours(
@@ -246,6 +273,24 @@ def _figure(width: float, height: float, ground: str = "white") -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained", facecolor=ground)
     FigureCanvasAgg(figure)
     return figure
+
+
+def _dark_png(
+    box: tuple[float, float, float, float], draw: Callable[[Axes], Any], label: str
+) -> bytes:
+    """Return one panel with a colour bar as PNG for a dark ground."""
+    from matplotlib import style
+
+    height = float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9.0))
+    with style.context("dark_background"):
+        figure = _figure(7.2, height + 0.6, ground=DARK)
+        ax = figure.subplots()
+        _bar(figure, draw(ax), [ax], label, extend="max")
+        _frame(ax, box)
+        ax.set_facecolor(DARK)
+        ax.set_xlabel("x (m)")
+        ax.set_ylabel("y (m)")
+        return _png(figure, dpi=100)
 
 
 def _save(figure: Figure, path: str | Path, dpi: int) -> None:

@@ -127,8 +127,8 @@ def judge(
     if cell is not None and not (np.isfinite(cell) and cell > 0):
         raise OptionError(f"cell: {cell} m, expected a length above 0")
     opened = Run.open(run)
-    data = _open_dataset(opened, dataset)
-    rows = _match(data.stamps, opened.stamps, f"{opened.path / 'poses.txt'}", f"{data.path}")
+    data = open_dataset(opened, dataset)
+    rows = match_stamps(data.stamps, opened.stamps, f"{opened.path / 'poses.txt'}", f"{data.path}")
     T_est, T_start = opened.T_world_camera, opened.T_world_camera_start
     T_measured = data.T_world_camera_measured[rows]
     if T_start is None:
@@ -263,7 +263,7 @@ def as_json(judged: Evaluation) -> dict[str, Any]:
     }
 
 
-def _open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
+def open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
     """Open the dataset of a run, or the one given in its place."""
     if path is None and not run.dataset_path.is_dir():
         raise RunError(
@@ -272,7 +272,7 @@ def _open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
     return Dataset.open(run.dataset_path if path is None else Path(path))
 
 
-def _match(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np.int64]:
+def match_stamps(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np.int64]:
     """Return for each stamp of ``want`` the index of the equal stamp in ``have``."""
     if not len(have):
         raise RunError(f"{owner}: holds no frames")
@@ -328,4 +328,4 @@ def _truth(
         true = data.T_world_camera_true
         return None if true is None else true[rows]
     stamps, T = trajectory.read_tum(Path(path))
-    return T[_match(stamps, run.stamps, f"{run.path / 'poses.txt'}", str(path))]
+    return T[match_stamps(stamps, run.stamps, f"{run.path / 'poses.txt'}", str(path))]

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import distance_transform_edt
 
-from depthba.clouds import transform
 from depthba.depth_map import DepthMap
 from depthba.picture import relief_image
 
@@ -21,7 +20,7 @@ MESH_NODES = 9_000
 PICTURE_SIDE = 360
 FINAL_SIDE = 1200
 """Largest side of the picture from above, pixels."""
-MESH_BYTES = 9_000_000
+MESH_BYTES = 7_000_000
 """Once the meshes take so much, only the first of each grid and the last are recorded."""
 VISIBLE = 0.002
 """Changes below this share of the map's height range are not recorded again."""
@@ -55,7 +54,7 @@ class RecordedMap:
         if self._range is None or final:
             low, high = np.quantile(heights[known], [0.01, 0.99])
             self._range = float(low), float(high)
-        filled = heights[tuple(_nearest(known))]
+        filled = filled_heights(depth_map)
         grid = (depth_map.shape, depth_map.origin, depth_map.spacing)
         same_grid = grid == self._grid and np.mean(known != self._known) < 0.01
         span = max(self._range[1] - self._range[0], 1e-9)
@@ -66,7 +65,7 @@ class RecordedMap:
         step = int(np.ceil(np.sqrt(heights.size / (MESH_NODES * (4 if final else 1)))))
         self._mesh(rec, depth_map, filled, step, same_grid and not final)
         side = FINAL_SIDE if final else PICTURE_SIDE
-        rec.log("map/picture", _picture(depth_map, self._range, side))
+        rec.log("map/picture", picture(depth_map, self._range, side))
         self._shown = filled
         if not same_grid:
             self._grid, self._known = grid, known
@@ -81,14 +80,7 @@ class RecordedMap:
     ) -> None:
         """Record vertices and their colours, and the triangles where they changed."""
         assert self._range is not None
-        thin = DepthMap(
-            heights=filled[::step, ::step],
-            origin=depth_map.origin,
-            spacing=step * depth_map.spacing,
-            T_map_world=depth_map.T_map_world,
-            count=depth_map.count[::step, ::step],
-            sigma=depth_map.sigma[::step, ::step],
-        )
+        thin = thinned(depth_map, filled, step)
         vertices = thin.vertices().reshape(-1, 3).astype(np.float32)
         colours = relief_image(thin, *self._range).reshape(-1, 4)
         self._bytes += vertices.nbytes + colours.nbytes
@@ -98,34 +90,33 @@ class RecordedMap:
                 rr.Mesh3D.from_fields(vertex_positions=vertices, vertex_colors=colours),
             )
             return
-        triangles = _triangles(np.isfinite(depth_map.heights[::step, ::step]))
+        faces = triangles(np.isfinite(depth_map.heights[::step, ::step]))
         rec.log(
             "map/surface",
-            rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colours),
+            rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours),
         )
 
 
-def residuals(depth_map: DepthMap, T_world_camera: Floats, points: Floats) -> Floats:
-    """Return the heights of points above the map, metres; NaN beside the map.
-
-    Args:
-        depth_map: the map, interpolated bilinearly.
-        T_world_camera: (4, 4).
-        points: (n, 3), sensor frame.
-
-    """
-    p = transform(depth_map.T_map_world @ T_world_camera, points)
-    at = (p[:, :2] - depth_map.origin) / depth_map.spacing
-    surface = map_coordinates(depth_map.heights, at[:, ::-1].T, order=1, cval=np.nan)
-    return np.asarray(p[:, 2] - surface)
+def filled_heights(depth_map: DepthMap) -> Floats:
+    """Return (ny, nx) heights, m; where nothing was seen, that of the nearest node that was."""
+    known = np.isfinite(depth_map.heights)
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(depth_map.heights[tuple(nearest)])
 
 
-def _nearest(known: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return (2, ny, nx), for each node the indices of the nearest known one."""
-    return np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
+def thinned(depth_map: DepthMap, heights: Floats, step: int) -> DepthMap:
+    """Return every ``step``-th node of a map, with other heights (ny, nx) in place of its own."""
+    return DepthMap(
+        heights=heights[::step, ::step],
+        origin=depth_map.origin,
+        spacing=step * depth_map.spacing,
+        T_map_world=depth_map.T_map_world,
+        count=depth_map.count[::step, ::step],
+        sigma=depth_map.sigma[::step, ::step],
+    )
 
 
-def _triangles(known: NDArray[np.bool_]) -> NDArray[np.uint32]:
+def triangles(known: NDArray[np.bool_]) -> NDArray[np.uint32]:
     """Return (m, 3), two triangles for each cell whose four nodes are known."""
     ny, nx = known.shape
     node = np.arange(ny * nx, dtype=np.uint32).reshape(ny, nx)
@@ -134,8 +125,11 @@ def _triangles(known: NDArray[np.bool_]) -> NDArray[np.uint32]:
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
-def _picture(depth_map: DepthMap, span: tuple[float, float], side: int) -> rr.EncodedImage:
-    """Return the map from above as JPEG, north up, no side longer than ``side`` pixels."""
+def picture(depth_map: DepthMap, span: tuple[float, float], side: int) -> rr.EncodedImage:
+    """Return the map from above as JPEG, north up, no side longer than ``side`` pixels.
+
+    The colours span the heights ``span``, m.
+    """
     rgba = relief_image(depth_map, *span)[::-1].astype(np.float32)
     alpha = rgba[..., 3:] / 255.0
     rgb = alpha * rgba[..., :3] + (1 - alpha) * np.array(GROUND, np.float32)

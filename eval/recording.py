@@ -2,12 +2,15 @@
 
 Everything is in the world frame, metres. What stands where:
 
-- ``cam/<i>``: pose of frame i over the iterations; its points and view frustum below it;
+- ``cam/<i>``: pose of frame i over the iterations; its points, in the frame's colour and coloured
+  by residual, and view frustum below it;
 - ``before/<i>``: the same frame at its start pose;
 - ``map/surface``, ``map/picture``: the depth map over the iterations, as a mesh and from above;
 - ``spread/before``, ``spread/after``: how far the frames disagree, from above;
 - ``centres/start``, ``centres/true``: where the cameras stood at the start, and in truth;
-- ``curves/...``, ``residual/<i>``: scalars over the iterations;
+- ``certainty/...``: the map tinted by its standard deviation, the covariance of the centres, the
+  directions that the data leave open;
+- ``curves/...``, ``residual/<i>``: scalars over the iterations; ``histogram/<i>``: the residuals;
 - ``figures``: the metrics for people; the properties of the recording hold them for programs.
 
 Iteration 0 is the start, iteration k + 1 what step k left. Frames count from 0 as in the dataset.
@@ -15,6 +18,7 @@ Iteration 0 is the start, iteration k + 1 what step k left. Frames count from 0 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -27,30 +31,33 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from depthba import se3
-from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, transform
+from depthba.clouds import FrameCloud, load_clouds
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import RunError
 from depthba.options import Options
 from depthba.picture import spread_png, spreads
 from depthba.result import Iteration, Result
-from depthba.run_folder import summary
-from depthba.spread import MAD_TO_SIGMA
+from depthba.run_folder import history_scalars, summary
 from eval.metrics import Metric, pose_errors
-from eval.recorded_map import RecordedMap, residuals
-from eval.recording_layout import blueprint, frame_colours
+from eval.recorded_certainty import log_certainty
+from eval.recorded_frames import log_centres, log_cloud, log_frustum, log_pose, shown_clouds
+from eval.recorded_map import RecordedMap
+from eval.recorded_residuals import RecordedResiduals
+from eval.recording_layout import blueprint, frame_colours, live_blueprint
 from eval.report import figures_page
 from eval.review import viewer
 
 Floats = NDArray[np.float64]
 
 APPLICATION = "depthba"
-CLOUD_POINTS = 160_000
-"""Points of all frames together; each is recorded twice at 12 bytes, before and after."""
-RESIDUAL_POINTS = 2_000
-"""Points of a frame that its residual is taken from."""
 MILLI = 1e3
 """Curves are in millimetres and milliradians: their axes can be read."""
+FLUSH_SECONDS = 20.0
+"""For what is on its way to a viewer or to the disk."""
+PART_SECONDS = 30.0
+"""After so much time a part of the recording is written."""
+SCALARS = ("cost", "sigma", "step_t", "step_r", "inliers", "spacing")
 
 CURVES: Mapping[str, tuple[str, tuple[int, int, int]]] = {
     "curves/cost/cost": ("cost", (230, 180, 60)),
@@ -76,6 +83,7 @@ class Recorder:
         dataset: Dataset,
         options: Options | None = None,
         clouds: Sequence[FrameCloud] | None = None,
+        viewer: str | None = None,
     ) -> None:
         """Begin a recording.
 
@@ -84,6 +92,7 @@ class Recorder:
             dataset: what is registered.
             options: how; for the properties and the region of interest.
             clouds: the points of all frames, where the caller has them already.
+            viewer: address of a viewer that shows each step as it comes, see `eval.live`.
 
         """
         self.path = Path(path)
@@ -91,57 +100,77 @@ class Recorder:
         self._dataset = dataset
         self._options = options or Options()
         self._clouds = load_clouds(dataset, colours=False) if clouds is None else tuple(clouds)
-        self._samples: list[Floats] = []
         self._true = dataset.T_world_camera_true
         self._colours = frame_colours(len(dataset))
         self._map = RecordedMap()
-        self._stream = rr.RecordingStream(APPLICATION)
-        self._stream.set_log_tick_enabled(False)
-        self._stream.set_log_time_enabled(False)
-        self._stream.save(self._part)
+        self._residuals: RecordedResiduals | None = None
+        self._last = (0, 0.0)
+        self._live = viewer is not None
+        self._stream = open_stream(self._part, viewer)
         self._stream.send_recording_name(self.path.resolve().parent.name)
 
     def __call__(self, iteration: Iteration) -> None:
         """Record the state after a step."""
         self._begin(self._dataset.T_world_camera_measured, iteration.depth_map)
-        self._time(iteration.index + 1, iteration.seconds)
+        self.scalars(history_scalars(iteration))
         self._state(iteration.T_world_camera, iteration.depth_map)
+
+    def scalars(self, step: Mapping[str, Any]) -> None:
+        """Record the scalars of a step; alone, where nothing else is left of it.
+
+        Args:
+            step: as `depthba.run_folder.history_scalars` gives them.
+
+        """
+        self._last = int(step["index"]) + 1, float(step["seconds"])
+        self._time(*self._last)
+        sizes = {n: np.nan if step[n] is None else float(step[n]) for n in SCALARS}
         self._scalars(
             {
-                "curves/cost/cost": _log10(iteration.cost),
-                "curves/sigma/sigma": MILLI * iteration.sigma,
-                "curves/step/translation": _log10(MILLI * iteration.step_t),
-                "curves/step/rotation": _log10(MILLI * iteration.step_r),
-                "curves/inliers/inliers": 100.0 * iteration.inliers,
-                "curves/spacing/spacing": MILLI * iteration.depth_map.spacing,
+                "curves/cost/cost": _log10(sizes["cost"]),
+                "curves/sigma/sigma": MILLI * sizes["sigma"],
+                "curves/step/translation": _log10(MILLI * sizes["step_t"]),
+                "curves/step/rotation": _log10(MILLI * sizes["step_r"]),
+                "curves/inliers/inliers": 100.0 * sizes["inliers"],
+                "curves/spacing/spacing": MILLI * sizes["spacing"],
             }
         )
 
-    def finish(self, result: Result, metrics: Sequence[Metric] | None = None) -> None:
+    def finish(
+        self,
+        result: Result,
+        metrics: Sequence[Metric] | None = None,
+        run: Mapping[str, Any] | None = None,
+    ) -> None:
         """Record the result and put the file into its place.
 
         Args:
             result: what the registration returned.
             metrics: what `eval.evaluate.evaluate` returned; None: the page of figures does without.
+            run: what result.json holds; None: it is made of the result.
 
         """
-        metrics = metrics or ()
+        run = summary(result, self._options, self._dataset) if run is None else run
         self._begin(result.T_world_camera_start, result.depth_map_start)
-        last = result.history[-1].seconds if result.history else 0.0
-        self._time(len(result.history) + 1, max(last, result.seconds.get("total", 0.0)))
+        count, seconds = self._last
+        self._time(count + 1, max(seconds, result.seconds.get("total", 0.0)))
         self._state(result.T_world_camera, result.depth_map, final=True)
         self._time(0, 0.0)
         self._state(result.T_world_camera_start, result.depth_map_start)
         self._before(result)
-        run = summary(result, self._options, self._dataset)
         rec = self._stream
+        scale = log_certainty(rec, result, self._colours)
         rec.send_property("run", rr.AnyValues(**_facts(run)))
-        _log_figures(rec, run, metrics)
+        _log_figures(rec, run, metrics or ())
         rec.send_blueprint(
-            blueprint(result.depth_map, result.T_world_camera, truth=self._true is not None)
+            blueprint(
+                result.depth_map,
+                result.T_world_camera,
+                truth=self._true is not None,
+                scale=scale,
+            )
         )
-        rec.flush()
-        rec.disconnect()
+        close_stream(rec)
         self._part.replace(self.path)
 
     def discard(self) -> None:
@@ -151,57 +180,36 @@ class Recorder:
 
     def _begin(self, T_world_camera: Floats, depth_map: DepthMap) -> None:
         """Record, once, what stays as it is: the frames' points and the names of the curves."""
-        if self._samples:
+        if self._residuals is not None:
             return
-        rec, share = self._stream, CLOUD_POINTS // max(len(self._clouds), 1)
-        rng = np.random.default_rng(0)
-        spacing = point_spacing(self._dataset, [c.points for c in self._clouds])
-        for i, (cloud, T) in enumerate(zip(self._clouds, T_world_camera, strict=True)):
-            p = cloud.points
-            p = p[inside(transform(depth_map.T_map_world @ T, p), self._options.roi)]
-            radius = 0.55 * spacing * np.sqrt(max(1.0, len(p) / share))
-            p = rng.permutation(p)[:share]
-            self._samples.append(p)
-            shown = rr.Points3D(p.astype(np.float32), colors=self._colours[i], radii=radius)
-            rec.log(f"cam/{i}/points", shown, static=True)
-            rec.log(f"before/{i}/points", shown, static=True)
-            self._frustum(f"cam/{i}", i, p)
-            self._frustum(f"before/{i}", i, p)
+        rec, camera = self._stream, self._dataset.sensor.camera
+        T_map_camera = depth_map.T_map_world @ T_world_camera
+        shown = shown_clouds(self._dataset, self._clouds, T_map_camera, self._options.roi)
+        for i, (cloud, colour) in enumerate(zip(shown, self._colours, strict=True)):
+            for root in (f"cam/{i}", f"before/{i}"):
+                log_cloud(rec, f"{root}/points", cloud, colour)
+                log_frustum(rec, f"{root}/image", camera, cloud.points, colour)
+        self._residuals = RecordedResiduals(rec, shown, self._colours)
         names = dict(CURVES)
         for i, (r, g, b) in enumerate(self._colours.tolist()):
             names[f"residual/{i}"] = (f"frame {i}", (r, g, b))
         for path, (name, rgb) in names.items():
             rec.log(path, rr.SeriesLines(names=name, colors=rgb), static=True)
         if self._true is not None:
-            p = se3.align_first(self._true, T_world_camera)[:, :3, 3]
-            self._centres("centres/true", p, (255, 255, 255), "true centre")
-
-    def _frustum(self, path: str, i: int, points: Floats) -> None:
-        """Record a camera's view as a small frustum."""
-        camera = self._dataset.sensor.camera
-        if camera is None:
-            return
-        size = 0.12 * float(np.median(points[:, 2])) if len(points) else 0.1
-        pinhole = rr.Pinhole(
-            image_from_camera=camera.matrix,
-            resolution=[camera.width, camera.height],
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=size,
-            color=self._colours[i],
-        )
-        self._stream.log(f"{path}/image", pinhole, static=True)
+            centres = se3.align_first(self._true, T_world_camera)[:, :3, 3]
+            log_centres(rec, "centres/true", centres, (255, 255, 255), "true centre")
+        if self._live:
+            truth = self._true is not None
+            rec.send_blueprint(live_blueprint(depth_map, T_world_camera, truth=truth))
 
     def _state(self, T_world_camera: Floats, depth_map: DepthMap, *, final: bool = False) -> None:
         """Record poses, map, residuals and, where truth is known, errors."""
+        assert self._residuals is not None
         for i, T in enumerate(T_world_camera):
-            self._stream.log(f"cam/{i}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+            log_pose(self._stream, f"cam/{i}", T)
         self._map.log(self._stream, depth_map, final=final)
-        scalars = {}
-        for i, (T, p) in enumerate(zip(T_world_camera, self._samples, strict=True)):
-            r = residuals(depth_map, T, p[:RESIDUAL_POINTS])
-            r = r[np.isfinite(r)]
-            if len(r):
-                scalars[f"residual/{i}"] = MILLI * MAD_TO_SIGMA * float(np.median(np.abs(r)))
+        sigmas = self._residuals.log(depth_map, T_world_camera, final=final)
+        scalars = {f"residual/{i}": MILLI * float(s) for i, s in enumerate(sigmas)}
         if self._true is not None and len(T_world_camera) > 1:
             aligned = se3.align_first(T_world_camera, self._true)
             e = np.abs(pose_errors(aligned, self._true)[1:])
@@ -213,23 +221,14 @@ class Recorder:
         """Record the start poses, and how far the frames disagree at them and at the result."""
         rec = self._stream
         for i, T in enumerate(result.T_world_camera_start):
-            shown = rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
-            rec.log(f"before/{i}", shown, static=True)
+            log_pose(rec, f"before/{i}", T, static=True)
         centres = result.T_world_camera_start[:, :3, 3]
-        self._centres("centres/start", centres, (150, 150, 150), "start centre")
+        log_centres(rec, "centres/start", centres, (150, 150, 150), "start centre")
         both = spreads(result, self._dataset, self._clouds, self._options.roi)
         for name, spread in (("before", both.before), ("after", both.after)):
             picture = spread_png(spread, result.depth_map, both.top)
             image = rr.EncodedImage(contents=picture, media_type="image/png")
             rec.log(f"spread/{name}", image, static=True)
-
-    def _centres(
-        self, path: str, centres: Floats, colour: tuple[int, int, int], label: str
-    ) -> None:
-        shown = rr.Points3D(
-            centres, colors=colour, radii=-4.0, labels=[label] * len(centres), show_labels=False
-        )
-        self._stream.log(path, shown, static=True)
 
     def _time(self, iteration: int, seconds: float) -> None:
         self._stream.set_time("iteration", sequence=iteration)
@@ -239,6 +238,30 @@ class Recorder:
         for path, value in values.items():
             if np.isfinite(value):
                 self._stream.log(path, rr.Scalars(value))
+
+
+def open_stream(path: Path | None, viewer: str | None = None) -> rr.RecordingStream:
+    """Begin a recording into a file, a viewer or both; no times but those that are set.
+
+    Without a viewer that waits for it, what comes is put together into few large parts: they are
+    read faster.
+    """
+    parts = rr.ChunkBatcherConfig(flush_tick=PART_SECONDS) if viewer is None else None
+    rec = rr.RecordingStream(APPLICATION, batcher_config=parts)
+    rec.set_log_tick_enabled(False)
+    rec.set_log_time_enabled(False)
+    sinks: list[Any] = [] if path is None else [rr.FileSink(path)]
+    if viewer is not None:
+        sinks.append(rr.GrpcSink(viewer))
+    rec.set_sinks(*sinks)
+    return rec
+
+
+def close_stream(rec: rr.RecordingStream) -> None:
+    """Bring everything to where it goes; a viewer that has been closed does not count."""
+    with contextlib.suppress(RuntimeError):
+        rec.flush(timeout_sec=FLUSH_SECONDS)
+    rec.disconnect()
 
 
 def add_figures(path: Path, run: Mapping[str, Any], metrics: Sequence[Metric]) -> None:

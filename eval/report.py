@@ -136,6 +136,37 @@ def figures_page(run: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+Row = tuple[str, Sequence[Metric], str, float | None, int | None]
+"""A run in a comparison: label, figures, status, seconds, iterations."""
+
+COMPARED = {
+    "translation_mae": "Translation error",
+    "rotation_mae": "Rotation error",
+    "ate_rmse": "Trajectory (ATE)",
+    "spread_median": "Frames disagree, median",
+    "spread_p90": "90 %",
+}
+"""The figures that runs are compared by."""
+
+
+def comparison_page(name: str, rows: Sequence[Row]) -> str:
+    """Return a short page in Markdown: one line for each run, the best of each figure in bold."""
+    figures = [{m.name: m for m in metrics} for _, metrics, *_ in rows]
+    names = [n for n in COMPARED if any(n in f for f in figures)]
+    best = {n: min((f[n].value for f in figures if n in f), default=np.nan) for n in names}
+    lines = []
+    for (label, _, status, seconds, iterations), found in zip(rows, figures, strict=True):
+        cells = []
+        for n in names:
+            text = show(found[n]) if n in found else ""
+            cells.append(f"**{text}**" if text and found[n].value == best[n] else text)
+        cells.append("" if iterations is None else str(iterations))
+        cells.append("" if seconds is None else f"{three_digits(seconds)} s")
+        lines.append([label, *cells, status.replace("_", " ")])
+    head = [name, *(COMPARED[n] for n in names), "Iterations", "Time", "Status"]
+    return _table(head, lines) + "\n"
+
+
 def figures_table(metrics: Sequence[Metric], start_metrics: Sequence[Metric]) -> str:
     """Return a Markdown table of the figures that count, start beside estimate."""
     before = {m.name: m for m in start_metrics}

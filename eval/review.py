@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -29,11 +30,20 @@ SCREENSHOT_SECONDS = 240
 SOFTWARE_DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 
 
-def recordings(runs: Sequence[Path]) -> list[Path]:
+def recordings(
+    runs: Sequence[Path], rebuild: bool = False, dataset: Path | None = None
+) -> list[Path]:
     """Return the recordings of run folders; without any, of the newest run in logs/.
 
+    Args:
+        runs: run folders, or recordings themselves.
+        rebuild: whether to make the recordings of folders anew, from their plain files; where
+            there is none, one is made in any case.
+        dataset: where the dataset is now, if not where the runs were made.
+
     Raises:
-        RunError: a folder is missing or has no recording.
+        RunError: a folder is missing, or is not the whole folder of a run that a recording could
+            be made of.
 
     """
     if not runs:
@@ -43,11 +53,13 @@ def recordings(runs: Sequence[Path]) -> list[Path]:
         runs = [latest]
     found = []
     for run in runs:
-        file = run if run.is_file() else run / RECORDING
         if not run.exists():
             raise RunError(f"{run}: no such run folder")
-        if not file.is_file():
-            raise RunError(f"{file}: no recording, expected the one that register leaves")
+        file = run if run.is_file() else run / RECORDING
+        if run.is_dir() and (rebuild or not file.is_file()):
+            from eval.rebuild import rebuild as make  # which needs this module
+
+            make(run, dataset)
         found.append(file.resolve())
     return found
 
@@ -74,10 +86,15 @@ def show(files: Sequence[Path]) -> None:
         RunError: there is no screen, or the viewer failed.
 
     """
+    need_screen("--web or --screenshot FILE.png")
+    _run([*_command(), *map(str, files)])
+
+
+def need_screen(instead: str) -> None:
+    """Raise RunError where no window can be opened, and say what to use instead."""
     on_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform.startswith("linux") and not on_screen:
-        raise RunError("no screen here (DISPLAY is not set): use --web or --screenshot FILE.png")
-    _run([*_command(), *map(str, files)])
+        raise RunError(f"no screen here (DISPLAY is not set): use {instead}")
 
 
 def serve(files: Sequence[Path], port: int | None = None) -> None:
@@ -89,10 +106,19 @@ def serve(files: Sequence[Path], port: int | None = None) -> None:
 
     """
     page, data = port or free_port(), free_port()
-    url = f"http://{LOCAL}:{page}?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
-    print(f"{url}\nCtrl-C ends it.", file=sys.stderr, flush=True)
+    print(f"{page_url(page, data)}\nCtrl-C ends it.", file=sys.stderr, flush=True)
+    _run([*web_command(page, data), *map(str, files)])
+
+
+def page_url(page: int, data: int) -> str:
+    """Return the address of the web viewer at port ``page`` with what is served at ``data``."""
+    return f"http://{LOCAL}:{page}?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
+
+
+def web_command(page: int, data: int) -> list[str]:
+    """Return the words that serve the web viewer, on this machine alone."""
     ports = ["--serve-web", "--web-viewer-port", str(page), "--port", str(data)]
-    _run([str(viewer()), "--bind", LOCAL, *ports, *map(str, files)])
+    return [str(viewer()), "--bind", LOCAL, *ports]
 
 
 def screenshot(files: Sequence[Path], picture: Path) -> None:
@@ -103,7 +129,7 @@ def screenshot(files: Sequence[Path], picture: Path) -> None:
         RunError: the viewer left no picture.
 
     """
-    driver = _software_driver()
+    driver = software_driver()
     with tempfile.TemporaryDirectory(prefix="depthba-") as folder, _screen() as display:
         shot = Path(folder) / "screenshot.png"
         environment = {
@@ -148,24 +174,36 @@ def _command() -> list[str]:
 
 def _run(command: Sequence[str]) -> None:
     """Run the viewer until it ends, the user interrupts or somebody ends this process."""
-
-    def leave(number: int, _: object) -> None:
-        raise SystemExit(128 + number)  # so that the viewer is ended below, and not orphaned
-
-    before = signal.signal(signal.SIGTERM, leave)
-    process = subprocess.Popen(command, env={"RUST_LOG": "warn", **os.environ})
-    try:
-        status = process.wait()
-    except KeyboardInterrupt:
-        return
-    finally:
-        _end(process)
-        signal.signal(signal.SIGTERM, before)
+    with terminated_cleanly():
+        process = subprocess.Popen(command, env={"RUST_LOG": "warn", **os.environ})
+        try:
+            status = process.wait()
+        except KeyboardInterrupt:
+            return
+        finally:
+            end(process)
     if status:
         raise RunError(f"{command[0]}: the viewer ended with status {status}")
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+@contextlib.contextmanager
+def terminated_cleanly() -> Iterator[None]:
+    """Within, a signal to terminate leaves through all that cleans up, so no viewer is orphaned."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
     """End a process that we started, gently first."""
     if process.poll() is None:
         process.terminate()
@@ -176,7 +214,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
-def _software_driver() -> Path:
+def software_driver() -> Path:
     """Return the description of Mesa's software renderer for Vulkan."""
     for folder in SOFTWARE_DRIVERS:
         for file in sorted(Path(folder).glob("lvp_icd*.json")):
@@ -188,12 +226,15 @@ def _software_driver() -> Path:
 
 @contextlib.contextmanager
 def _screen() -> Iterator[str]:
-    """Give the name of a virtual screen, larger than the window: its pointer rests beside it."""
+    """Give the name of a virtual screen, so large that its pointer rests beside the window.
+
+    The pointer rests in the middle, and the viewer draws a screenshot at twice its size.
+    """
     program = shutil.which("Xvfb")
     if program is None:
         raise MissingPackage("Xvfb is not installed: apt-get install xvfb")
     read, write = os.pipe()
-    size = f"{2 * WINDOW[0] + 200}x{2 * WINDOW[1] + 200}x24"
+    size = f"{4 * WINDOW[0] + 200}x{4 * WINDOW[1] + 200}x24"
     try:
         process = subprocess.Popen(
             [program, "-displayfd", str(write), "-screen", "0", size, "-noreset"],
@@ -210,4 +251,4 @@ def _screen() -> Iterator[str]:
             raise RunError(f"{program}: ended at once, expected a virtual screen")
         yield f":{number}"
     finally:
-        _end(process)
+        end(process)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from depthba.errors import MissingPackage
 from depthba.options import Options
-from depthba.verbs import DONE, NOT_TO_BE_TRUSTED
+from depthba.verbs import DONE, NOT_TO_BE_TRUSTED, WRONG_USAGE
 from depthba.verbs.output import angle, length, note, print_json
 
 if TYPE_CHECKING:
@@ -37,6 +38,10 @@ class Arguments:
     """Write into the folder even where it holds an earlier run."""
     json: bool = False
     """Print one JSON object on stdout in place of text."""
+    live: bool = False
+    """Open the viewer at once, and show every step as it comes."""
+    web: bool = False
+    """With --live: serve to a browser, on 127.0.0.1 alone, in place of opening a window."""
     options: Options = field(default_factory=Options)
 
 
@@ -59,14 +64,26 @@ def run(arguments: Arguments) -> int:
     """Register a dataset, write the run folder, say how it went; return the exit status."""
     from depthba.dataset import Dataset
 
+    if arguments.web and not arguments.live:
+        note("depthba register: --web goes with --live alone; `depthba review --web` comes after")
+        return WRONG_USAGE
     dataset = Dataset.open(arguments.dataset)
     for warning in dataset.warnings:
         note(f"warning: {warning}")
-    outcome = register_into(dataset, arguments.options, arguments.out, arguments.overwrite)
-    if arguments.json:
-        print_json(summary(outcome))
-    else:
-        print("\n".join(report(dataset.name, outcome)))
+    with _viewer(arguments) as viewer:
+        outcome = register_into(
+            dataset,
+            arguments.options,
+            arguments.out,
+            arguments.overwrite,
+            viewer=None if viewer is None else viewer.address,
+        )
+        if arguments.json:
+            print_json(summary(outcome))
+        else:
+            print("\n".join(report(dataset.name, outcome)), flush=True)
+        if viewer is not None:
+            viewer.stay()
     return DONE if outcome.result.trusted else NOT_TO_BE_TRUSTED
 
 
@@ -77,6 +94,7 @@ def register_into(
     overwrite: bool = False,
     evaluate: bool = False,
     record: bool = True,
+    viewer: str | None = None,
 ) -> Outcome:
     """Register a dataset into a run folder, with progress on stderr and a recording.
 
@@ -87,6 +105,7 @@ def register_into(
         overwrite: whether the folder may hold an earlier run.
         evaluate: judge the run too, so that the recording shows the figures.
         record: make a recording.
+        viewer: address of a viewer that shows every step as it comes; needs the recording.
 
     Raises:
         DepthbaError: the dataset, the options or the folder do not do. A folder that was
@@ -100,7 +119,7 @@ def register_into(
     with removed_on_failure(path, overwrite):
         folder = RunFolder.create(path, overwrite=overwrite)
         with (
-            _recorder(path / "run.rrd", dataset, options, record) as recorder,
+            _recorder(path / "run.rrd", dataset, options, record, viewer) as recorder,
             RegistrationProgress(dataset.name) as progress,
         ):
             callback = _Callback(progress, recorder)
@@ -224,13 +243,33 @@ def removed_on_failure(path: Path, overwrite: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _recorder(path: Path, dataset: Dataset, options: Options, wanted: bool) -> Iterator[Any]:
+def _viewer(arguments: Arguments) -> Iterator[Any]:
+    """Give a viewer from the package above; where it is not wanted, None."""
+    if not arguments.live:
+        yield None
+        return
+    try:
+        live = importlib.import_module("eval.live")
+    except ImportError as error:
+        raise MissingPackage(
+            f"register --live needs {error.name}, which is not installed: "
+            "pip install 'depthba[eval]'"
+        ) from error
+    with live.opened(arguments.web) as viewer:
+        yield viewer
+
+
+@contextmanager
+def _recorder(
+    path: Path, dataset: Dataset, options: Options, wanted: bool, viewer: str | None
+) -> Iterator[Any]:
     """Give a recorder from the package above; where it is not wanted or not there, None."""
     if not wanted:
         yield None
         return
     try:
-        recorder = importlib.import_module("eval.recording").Recorder(path, dataset, options)
+        recording = importlib.import_module("eval.recording")
+        recorder = recording.Recorder(path, dataset, options, viewer=viewer)
     except ImportError as error:
         note(f"note: no recording is made ({error}): pip install 'depthba[eval]'")
         yield None

@@ -165,6 +165,16 @@ def made_result(dataset: Dataset, T_end: Floats, steps: int = 4) -> Result:
     )
 
 
+def listeners(port: int) -> list[str]:
+    """Where this machine listens on a port: addresses as the kernel writes them."""
+    rows = [
+        row.split()
+        for table in ("tcp", "tcp6")
+        for row in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+    ]
+    return [r[1] for r in rows if r[3] == "0A" and r[1].endswith(f":{port:04X}")]
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """The surface, with truth."""
