@@ -84,7 +84,7 @@ def run(arguments: Arguments) -> int:
     out = (arguments.out or Path("logs/benchmark")).absolute()
     if out.exists() and not out.is_dir():
         raise RunError(f"{out}: is a file, expected a folder for the benchmark")
-    cases, methods = _cases(arguments, out), _methods(arguments)
+    methods, cases = _methods(arguments), _cases(arguments, out)
     jobs = [
         Job(
             case, methods, out, arguments.threads, arguments.time_limit,
