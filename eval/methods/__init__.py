@@ -48,10 +48,8 @@ METHODS: dict[str, Entry] = {
         "T+PGO (GNC)", "eval.methods.pose_graph", "TeaserPgoGnc", ("open3d", "gtsam")
     ),
     "teaser-ba": Entry("T+BA", "eval.methods.bundle", "TeaserBa", ("open3d",)),
-    "balm2": Entry("BALM2", "eval.methods.planes", "Balm2", ("open3d",)),
-    "balm2-fine": Entry(
-        "BALM2 (coarse to fine)", "eval.methods.planes", "Balm2CoarseToFine", ("open3d",)
-    ),
+    "balm2": Entry("BALM2", "eval.methods.planes", "Balm2"),
+    "balm2-fine": Entry("BALM2 (coarse to fine)", "eval.methods.planes", "Balm2CoarseToFine"),
     "gicp-pgo": Entry("GICP+PGO", "eval.methods.pose_graph", "GicpPgo", ("small_gicp", "gtsam")),
     "kiss": Entry("KISS-Matcher", "eval.methods.chain", "Kiss", ("kiss_matcher",)),
     "open3d-multiway": Entry(

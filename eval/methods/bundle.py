@@ -19,6 +19,9 @@ class TeaserBa:
     pairs: PairOptions = field(default_factory=PairOptions)
     least_overlap: float = 0.25
     """Two frames are paired when they share this part of the smaller one's ground."""
+    fewest: int = 8
+    """A pair with fewer inliers is left out, unless nothing else ties its frames to frame 0: among
+    2000 matches so few agree by chance."""
     huber: float | None = None
     """Residual beyond which a landmark's pull no longer grows, m; None: half the feature voxel."""
     iterations: int = 100
@@ -39,22 +42,35 @@ class TeaserBa:
         if huber is None:
             huber = 0.5 * pair_voxel(task, self.pairs, watch)
         task.say("bundle adjustment")
+        support = [len(p.inliers) for p in found]
         with watch("tracks"):
-            links = [Link(p.target, p.source, p.matches[p.inliers]) for p in found]
+            edges = [Edge(p.target, p.source, p.T_target_source, isotropic(1, 1)) for p in found]
+            T, tree = spanning_tree(task.T_world_camera, edges, support)
+            chance = {k for k, s in enumerate(support) if s < self.fewest} - set(tree)
+            links = [
+                Link(p.target, p.source, p.matches[p.inliers])
+                for k, p in enumerate(found)
+                if k not in chance
+            ]
             tracks = build_tracks([k.points for k in keypoints], links)
             tied = tied_frames(tracks)
             tracks = only_frames(tracks, tied)
         if not tied[1:].any():
             raise MethodError("no frame shares three landmarks with the first one")
         with watch("adjust"):
+<<<<<<< HEAD
             edges = [Edge(p.target, p.source, p.T_target_source, isotropic(1, 1)) for p in found]
             support = [len(p.inliers) for p in found]
             T, _ = spanning_tree(task.T_world_camera, edges, support)
+=======
+>>>>>>> w-planes
             T[~tied] = task.T_world_camera[~tied]
             solution = adjust(tracks, T, LandmarkOptions(huber, self.iterations))
         notes = []
         if failed:
             notes.append(f"{len(failed)} of {len(wanted)} pairs could not be matched")
+        if chance:
+            notes.append(f"{len(chance)} pairs left out in which as few matches agree as by chance")
         if not tied.all():
             loose = ", ".join(str(f.id) for f, t in zip(task.dataset, tied, strict=True) if not t)
             notes.append(f"frames that no landmarks tie to the first one: {loose}")
