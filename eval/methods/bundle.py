@@ -58,12 +58,6 @@ class TeaserBa:
         if not tied[1:].any():
             raise MethodError("no frame shares three landmarks with the first one")
         with watch("adjust"):
-<<<<<<< HEAD
-            edges = [Edge(p.target, p.source, p.T_target_source, isotropic(1, 1)) for p in found]
-            support = [len(p.inliers) for p in found]
-            T, _ = spanning_tree(task.T_world_camera, edges, support)
-=======
->>>>>>> w-planes
             T[~tied] = task.T_world_camera[~tied]
             solution = adjust(tracks, T, LandmarkOptions(huber, self.iterations))
         notes = []
