@@ -30,6 +30,7 @@ CELL_SPACINGS = 4.0
 EMPTY, DARK = "#e9e9ec", "#121212"
 SPREADS = "inferno_r"
 SIGMAS = "YlOrRd"
+"""Seen on dark ground at either end."""
 HEIGHTS = (
     (66, 104, 138),
     (104, 158, 160),
@@ -162,11 +163,16 @@ def before_after(
     _save(figure, path, dpi=100)
 
 
-def spread_png(spread: CellSpread, depth_map: DepthMap, top: float) -> bytes:
-    """Return the spread alone as PNG for a dark ground, with colours up to ``top`` mm."""
+def spread_png(
+    spread: CellSpread, depth_map: DepthMap, top: float, colours: str = SPREADS
+) -> bytes:
+    """Return the spread alone as PNG for a dark ground, with colours up to ``top`` mm.
+
+    Where much may lie beyond ``top``, ``colours`` should not end as dark as the ground.
+    """
     return _dark_png(
         _extent(depth_map),
-        lambda ax: _draw_spread(ax, spread, top),
+        lambda ax: _draw_spread(ax, spread, top, colours),
         "spread between frames (mm)",
     )
 
@@ -343,7 +349,7 @@ def _draw_relief(ax: Axes, depth_map: DepthMap, span: tuple[float, float]) -> An
     return ScalarMappable(Normalize(*span), ListedColormap(ramp.tolist()))
 
 
-def _draw_spread(ax: Axes, spread: CellSpread, top: float) -> Any:
+def _draw_spread(ax: Axes, spread: CellSpread, top: float, colours: str = SPREADS) -> Any:
     """Draw the spread in mm."""
     ny, nx = spread.shape
     x, y, s = *spread.origin, spread.cell
@@ -351,7 +357,7 @@ def _draw_spread(ax: Axes, spread: CellSpread, top: float) -> Any:
         1e3 * spread.image(),
         extent=(x, x + nx * s, y, y + ny * s),
         origin="lower",
-        cmap=SPREADS,
+        cmap=colours,
         vmin=0.0,
         vmax=top,
         interpolation="nearest",

@@ -24,7 +24,7 @@ from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, trans
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import DatasetError, RunError
-from depthba.picture import CELL_SPACINGS, spread_png
+from depthba.picture import CELL_SPACINGS, SIGMAS, spread_png
 from depthba.run_folder import read_result
 from depthba.spread import CellSpread, cell_spread
 from eval.evaluate import match_stamps
@@ -216,7 +216,7 @@ def _log_runs(
     few = shown_clouds(dataset, clouds, np.tile(np.eye(4), (len(dataset), 1, 1)), None, total)
     known = views[-1].depth_map.heights[np.isfinite(views[-1].depth_map.heights)]
     low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
-    # a scale that tells the methods apart, on which the start may be dark all over
+    # a scale that tells the methods apart, on which the start may be red all over
     top = 1e3 * float(np.nanmax([*(v.spread.quantile(0.9) for v in views[1:]), 1e-9]))
     by_run = [
         [residuals(v.depth_map, T, c.points) for T, c in zip(Ts, few, strict=True)]
@@ -236,7 +236,7 @@ def _log_runs(
             picture(view.depth_map, (float(low), float(high)), PICTURE_SIDE),
             static=True,
         )
-        png = spread_png(view.spread, view.depth_map, top)
+        png = spread_png(view.spread, view.depth_map, top, SIGMAS)
         image = rr.EncodedImage(contents=png, media_type="image/png")
         rec.log(f"run/{k}/spread", image, static=True)
 

@@ -177,7 +177,8 @@ def compare_blueprint(
             )
             for k, label in enumerate(labels)
         ]
-        shares = [5.0, 1.0]
+        lines = len(labels) + 1
+        shares = [1.0, (90 + 24 * lines) / (770 - 24 * lines)]  # of 860 points of height
         return _whole(rrb.Vertical(rrb.Horizontal(*columns), table, row_shares=shares), time=False)
     kinds = rrb.Tabs(
         rrb.Grid(*(clouds(k, "points", x) for k, x in enumerate(labels)), name="Clouds by frame"),
