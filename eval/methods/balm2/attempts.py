@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.errors import OptionError
 from eval.methods.balm2.clusters import Floats
 from eval.methods.balm2.schedule import Registered, Schedule, plane_share, register, thinned_clouds
 from eval.methods.method import MethodError, Stopwatch
@@ -50,7 +51,7 @@ def register_best(
     for schedule in schedules:
         try:
             found = register(clouds, T_world_camera, schedule, watch, say)
-        except MethodError as error:
+        except (MethodError, OptionError) as error:  # frames that flew off leave too many voxels
             failures.append(str(error))
             continue
         with watch("planes"):
