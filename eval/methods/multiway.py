@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from eval.methods.features import near_clouds
 from eval.methods.graph import connected
 from eval.methods.method import Estimate, MethodError, Stopwatch, Task, relative
 from eval.methods.overlap import LEAST, overlapping_pairs
@@ -69,7 +70,7 @@ class Open3dMultiway:
             o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error),
             watch("points"),
         ):
-            clouds = [_prepared(points, voxel) for points in task.clouds]
+            clouds = [_prepared(points, voxel) for points in near_clouds(task)]
         graph = o3d.pipelines.registration.PoseGraph()
         for T in task.T_world_camera:
             graph.nodes.append(o3d.pipelines.registration.PoseGraphNode(T))

@@ -10,6 +10,7 @@ from depthba.errors import OptionError
 from eval.methods.balm2.attempts import register_best
 from eval.methods.balm2.schedule import Registered, Schedule, register
 from eval.methods.balm2.solver import SolverOptions
+from eval.methods.features import near_clouds
 from eval.methods.method import Estimate, MethodError, Stopwatch, Task
 
 FIXED = 0.18
@@ -41,6 +42,7 @@ class Balm2:
 
     def run(self, task: Task) -> Estimate:
         """Register the frames from the start poses."""
+        task = replace(task, clouds=near_clouds(task))
         voxel = FIXED * frame_extent(task) if self.voxel is None else self.voxel
         schedule = Schedule((voxel,), _thinned(task, self.thinned, 1.5))
         watch = Stopwatch()
@@ -75,6 +77,7 @@ class Balm2CoarseToFine:
 
     def run(self, task: Task) -> Estimate:
         """Register the frames from the start poses."""
+        task = replace(task, clouds=near_clouds(task))
         coarsest = COARSEST * frame_extent(task) if self.coarsest is None else self.coarsest
         finest = FINEST * task.spacing if self.finest is None else self.finest
         flat = Schedule(

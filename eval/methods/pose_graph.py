@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from eval.methods.features import REACH as BACKGROUND
+from eval.methods.features import near_clouds
 from eval.methods.gicp import Alignment, GicpOptions, Prepared, align, prepare
 from eval.methods.graph import Edge, Solved, isotropic, solve, solve_robustly, spanning_tree
 from eval.methods.method import Estimate, MethodError, Stopwatch, Task, relative
@@ -48,6 +50,8 @@ class GicpPgo:
     """See `overlapping_pairs`."""
     fewest: int = 100
     """A pair with fewer partners is left out."""
+    background: float = BACKGROUND
+    """How far points are used, in a frame's median ranges; see `features.near`."""
     gicp: GicpOptions = field(default_factory=GicpOptions)
 
     def run(self, task: Task) -> Estimate:
@@ -61,7 +65,8 @@ class GicpPgo:
         if not pairs:
             raise MethodError("no two frames overlap")
         with watch("points"):
-            prepared = [prepare(p, voxel, self.gicp, task.threads) for p in task.clouds]
+            clouds = near_clouds(task, self.background)
+            prepared = [prepare(p, voxel, self.gicp, task.threads) for p in clouds]
         T = task.T_world_camera
         for k in range(self.rounds):
             now = max(reach / self.shrink**k, least)
