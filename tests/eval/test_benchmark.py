@@ -50,6 +50,7 @@ def run(*jobs: Job) -> dict[str, Outcome]:
 
 def test_every_end_is_a_row(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
+    ballast = np.ones(100_000_000)  # memory of whoever runs a method is not the method's
     found = run(
         job(dataset, tmp_path, "initial", "Knows", "Refuses", "Raises", "Dies", "Diverges"),
     )
@@ -65,11 +66,12 @@ def test_every_end_is_a_row(dataset: Path, tmp_path: Path, monkeypatch: pytest.M
     assert re.fullmatch(r"KeyError: 'nothing' \(odd_methods.py:\d+\)", found["Raises"].reason)
     assert "signal 9" in found["Dies"].reason
     assert "not finite" in found["Diverges"].reason
+    assert ballast.nbytes == 8e8
     knows = found["Knows"]
     assert knows.value("translation_mae_x") == pytest.approx(0.001, rel=1e-6)
     assert knows.value("rotation_mae") == pytest.approx(0.0, abs=1e-9)
     assert knows.total == 1.5 and knows.iterations == 3
-    assert knows.memory is not None and 3e7 < knows.memory < 4e9
+    assert knows.memory is not None and 3e7 < knows.memory < 6e8
     folder = tmp_path / dataset.name / f"{ODD}Knows"
     poses = read_tum(folder / outcome.POSES)[1]
     assert poses.shape == (FRAMES, 4, 4)
