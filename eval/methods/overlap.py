@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.clouds import transform
+from depthba.optimiser.start import pose_sigmas
+from depthba.options import Options
 from depthba.picture import CELL_SPACINGS
 from eval.methods.method import Task
 from eval.self_consistency import map_rotation
@@ -16,10 +18,6 @@ Floats = NDArray[np.float64]
 
 LEAST = 0.25
 """Two frames overlap when they share this part of the smaller one's cells."""
-USUAL_SIGMA_T = 0.01
-"""Of a start pose of unknown accuracy, m per axis."""
-USUAL_SIGMA_R = 0.02
-"""The same for its rotation, rad per axis."""
 SIGMAS = 3.0
 """Heights in a cell may differ by this many standard deviations of the start's error."""
 
@@ -66,13 +64,13 @@ def overlap(task: Task) -> Floats:
 def displacement(task: Task) -> float:
     """Return by how far the start's error moves a point along one axis, standard deviation, m.
 
-    The dataset's ``pose_noise`` where it states one, else 10 mm and 20 mrad; a rotation acts over
-    the median distance of the points.
+    The dataset's ``pose_noise`` where it states one, else what a registration believes; a rotation
+    acts over the median distance of the points.
     """
-    sigma_t, sigma_r = USUAL_SIGMA_T, USUAL_SIGMA_R
-    if (stated := task.dataset.pose_noise) is not None:
-        sigma_t = float(np.sqrt(np.mean(np.square(stated.sigma_t_m))))
-        sigma_r = float(np.sqrt(np.mean(np.square(stated.sigma_r_rad))))
+    sigma_t, sigma_r = (
+        float(np.sqrt(np.mean(np.square(sigma))))
+        for sigma in pose_sigmas(task.dataset.pose_noise, Options())
+    )
     reaches = [np.median(np.linalg.norm(points, axis=1)) for points in task.clouds if len(points)]
     return float(np.hypot(sigma_t, sigma_r * np.median(reaches))) if reaches else sigma_t
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from depthba import se3
@@ -14,11 +13,9 @@ from depthba.dataset import Dataset
 from depthba.dataset.model import Frame
 from depthba.dataset.sensor import Sensor
 from eval.methods.method import Task
+from tests.eval.oracle_scenes import oracle
 
 Floats = NDArray[np.float64]
-
-ORACLES = Path(__file__).parents[3] / "shared" / "oracles"
-SCENES = ORACLES / "scenes_s0_s1.npz"
 
 
 def reference_task(
@@ -28,9 +25,7 @@ def reference_task(
 
     Returns the task, the true poses (12, 4, 4) and the overlaps at the truth (12, 12).
     """
-    if not SCENES.exists():
-        pytest.skip("the reference scenes do not lie beside the checkout")
-    with np.load(SCENES, allow_pickle=False) as stored:
+    with np.load(oracle("scenes_s0_s1.npz"), allow_pickle=False) as stored:
         depth = stored[f"depth_{name}"].astype(float)
         T_true, overlap = stored[f"T_world_camera_{name}"], stored[f"overlap_{name}"]
         f, cx, cy = (float(stored[k]) for k in ("fx", "cx", "cy"))

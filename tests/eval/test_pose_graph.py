@@ -13,6 +13,7 @@ from depthba import se3
 from eval.methods.gicp import GicpOptions, align, prepare
 from eval.methods.graph import Edge, isotropic, solve, solve_robustly, spanning_tree
 from eval.methods.method import MethodError, relative
+from eval.methods.pairs import PairOptions
 from eval.methods.pose_graph import GicpPgo, TeaserPgo, TeaserPgoGnc, usual_reach
 from eval.methods.voxel import usual_voxel
 from eval.metrics import pose_metrics
@@ -224,11 +225,8 @@ def test_teaser_pairs_on_the_reference_scenes(
     name: str, voxel: float, translation: float, rotation: float
 ) -> None:
     """On s1 the figures are those of the robust graph: the reference's other one is lost."""
-    pairs = pytest.importorskip("eval.methods.pairs")
-    if not hasattr(pairs, "feature_pairs"):
-        pytest.skip("pairs cannot be registered by features here")
     task, T_true, _ = reference_task(name, 0.01, 0.02)
-    options = pairs.PairOptions(voxel=voxel)
+    options = PairOptions(voxel=voxel)
     for method in (TeaserPgo(pairs=options), TeaserPgoGnc(pairs=options)):
         found = method.run(task)
         errors = {m.name: m.value for m in pose_metrics(found.T_world_camera, T_true)}
