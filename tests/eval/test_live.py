@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,9 @@ from eval.live import CaptureLog
 from eval.recording import Recorder
 from tests.eval.conftest import listeners, write_scene
 
+PATIENCE = 30.0
+"""Seconds that a viewer has to save what it was sent."""
+
 
 class SavingViewer:
     """A real viewer process without a window, that saves what it is sent."""
@@ -38,9 +42,24 @@ class SavingViewer:
         self.process = subprocess.Popen([*command, "--save", str(file)], env=environment)
         live.await_port(self.process, port)
 
-    def end(self) -> RrdReader:
+    def end(self, entities_due: set[str] | None = None) -> RrdReader:
+        """End it, once it has saved the entities due: it writes some time after it is sent."""
+        if entities_due is not None:
+            deadline, before = time.monotonic() + PATIENCE, -1
+            while time.monotonic() < deadline:
+                now = self.file.stat().st_size
+                if now == before and self._saved() >= entities_due:
+                    break
+                before = now
+                time.sleep(0.5)
         review.end(self.process)
         return RrdReader(self.file)
+
+    def _saved(self) -> set[str]:
+        try:
+            return entities(RrdReader(self.file))
+        except (ValueError, RuntimeError):  # caught in the middle of a write
+            return set()
 
 
 @pytest.fixture
@@ -62,8 +81,8 @@ def test_a_registration_is_seen_while_it_runs(
     for iteration in result.history:
         recorder(iteration)
     recorder.finish(result)
-    seen = viewer.end()
     kept = RrdReader(tmp_path / "run.rrd")
+    seen = viewer.end(entities(kept))
     assert entities(seen) == entities(kept)
     assert len(seen.blueprints()) == 2  # one while it runs, one of the finished run
 
@@ -117,7 +136,8 @@ def test_a_capture_is_seen_as_it_goes(viewer: SavingViewer, tmp_path: Path) -> N
     log.poses(dataset.T_world_camera_true)
     assert not (tmp_path / "run.rrd").exists()  # not before it is whole
     log.finish()
-    for reader in (viewer.end(), RrdReader(tmp_path / "run.rrd")):
+    kept = RrdReader(tmp_path / "run.rrd")
+    for reader in (viewer.end(entities(kept)), kept):
         assert entities(reader) >= {
             *(f"/cam/{i}{part}" for i in range(3) for part in ("", "/points", "/image")),
             "/path/way",
