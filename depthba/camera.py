@@ -99,6 +99,14 @@ class RangeNoise:
             self.sigma_m * (np.asarray(z, dtype=np.float64) / self.at_m) ** self.power
         )
 
+    def of_points(self, points: ArrayLike) -> Array:
+        """Return the standard deviation of the range, metres, at points (n, 3)."""
+        p = np.asarray(points, dtype=np.float64)
+        sigma = self.sigma(p[:, 2])
+        if self.along == "z":  # an error of z moves the point along its ray by that much more
+            sigma = sigma * np.linalg.norm(p, axis=1) / np.maximum(p[:, 2], 1e-9)
+        return np.asarray(sigma)
+
 
 def _distort(xy: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
     """Return distorted normalised coordinates (..., 2) and their Jacobian (..., 2, 2)."""

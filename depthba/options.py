@@ -31,6 +31,9 @@ class Options:
     priors: bool = True
     """Take the measured poses as measurements, too. Off: they are only where to start (the paper
     preset never takes them)."""
+    fixed_pattern: bool = True
+    """Solve for an error of the range that is the same in every frame, too. Off: there is none (the
+    paper preset never has one)."""
     prior_t: float | None = None
     """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.01
     (paper: no prior)."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from depthba.optimiser import coupling, probes, reduced
+from depthba.optimiser import coupling, pattern, probes, reduced
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
@@ -77,6 +77,7 @@ def correlation(
     free: NDArray[np.bool_],
     workers: Workers,
     reduction: reduced.Reduction | None = None,
+    believed: pattern.Believed | None = None,
 ) -> Correlation:
     """Measure how the residuals' correlation over the image inflates the variance of the poses.
 
@@ -87,9 +88,13 @@ def correlation(
     the prior P, so that the directions count that the data hold least. The prior's weight T depends
     on the factor in turn, which a few rounds settle. In units of what the data say, S, all
     directions count alike: the second factor.
+
+    A fixed pattern that was ``believed`` in and solved for is eliminated as the map is. It leaves
+    little that all frames have in common, so blocks count that are dealt out anew for each frame,
+    too, and whichever of the two says more.
     """
     reduction = reduction or reduced.reduce(lin, workers)
-    S = reduction.S
+    S = reduction.S if believed is None else believed.eliminated(reduction.S)
     keep = np.repeat(free, 6)
     if not keep.any():
         return Correlation(1.0, 1.0, S, 0.0, np.zeros((1, len(S))))
@@ -98,19 +103,30 @@ def correlation(
     count = BLOCKS[0] * BLOCKS[1]
     rng = np.random.default_rng(0)
     random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
-    groups = [np.stack(g) for g in zip((f.blocks for f in problem.frames), random, strict=True)]
-    scores = block_scores(problem, grid, state, loss, lin, groups, workers, reduction)[..., keep]
+    blocks = tuple(f.blocks for f in problem.frames)
+    kinds = [blocks, random]
+    if believed is not None:
+        kinds.append(tuple(rng.permutation(count).astype(np.uint8)[b] for b in blocks))
+    groups = [np.stack(g) for g in zip(*kinds, strict=True)]
+    scores = block_scores(problem, grid, state, loss, lin, groups, workers, reduction)
+    if believed is not None and problem.waves is not None:
+        own = pattern.scores(
+            Ground(problem, grid, state, loss), lin, problem.waves, believed.found, groups, count,
+            workers,
+        )  # fmt: skip
+        scores = scores + believed.follow(own)
+    scores = scores[..., keep]
     scores = scores - scores.mean(axis=1, keepdims=True)
     variance = robust_sigma(lin.residuals) ** 2
     factor = 1.0
     for _ in range(10):
         V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
-        factor = max(1.0, spread[0] / max(spread[1], 1e-300))
+        factor = max(1.0, max(spread[0], spread[-1]) / max(spread[1], 1e-300))
     V = np.linalg.inv(inner + max(variance, 1e-30) * P)
-    both = _neighbours_mixed(scores[0]), scores[1]
-    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in both]
-    overall = max(1.0, alike[0] / max(alike[1], 1e-300))
+    mixed = (_neighbours_mixed(scores[0]), *scores[1:])
+    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in mixed]
+    overall = max(1.0, max(alike[0], alike[-1]) / max(alike[1], 1e-300))
     T = max(factor * variance, 1e-30)
     owed = float(eigh(T * P, inner + T * P, eigvals_only=True)[-1])
     whole = np.zeros((count, len(S)))

@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import certainty, reduced, schedule
+from depthba.optimiser import certainty, pattern, reduced, schedule
 from depthba.optimiser.bends import without_bends
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
@@ -46,6 +46,8 @@ CLEARLY = 0.9
 AGAIN = 4
 # It goes on when their inflation has come out below this share of what was believed.
 LESS = 0.8
+# It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
+BENT = 0.3
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class Known:
     """Without the points at sharp bends."""
     lin: Linearisation
     correlation: certainty.Correlation
+    believed: pattern.Believed | None = None
+    """The fixed pattern of the camera; None: there is none."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ class Engine:
     noisy: float = 1.0
     """Largest share of noise in what the data said about a direction, when last measured."""
     history: list[Iteration] = field(default_factory=list)
+    bend: NDArray[np.float64] | None = None
+    """(m,), m at a point of typical noise: what has been taken off the points; None: nothing."""
 
     @property
     def preset(self) -> schedule.Preset:
@@ -150,10 +156,14 @@ class Engine:
             known = there.correlation
             finer = self._finer(level.grid.spacing, known, outcome)
             less = known.inflation < LESS * believed
-            if not outcome.converged or not (less or finer < level.grid.spacing):
+            bent = self._bent(there, outcome.sigma)
+            if not outcome.converged or not (less or bent or finer < level.grid.spacing):
                 return End(level, outcome, temperature, there)
             # poses that had not settled had made the residuals look more alike than they are
             believed, state, lin = known.inflation, outcome.state, outcome.lin
+            if bent and there.believed is not None:
+                level = self._unbent(level, there.believed.pattern)
+                state, lin = self._map_solved(level, state)
             if finer < level.grid.spacing:
                 index += 1
                 level, state, lin = self._lay(
@@ -166,6 +176,24 @@ class Engine:
             self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature)
 
+    def _bent(self, there: Known, sigma: float) -> bool:
+        """Whether the camera's fixed pattern calls for steps that are worth taking."""
+        if there.believed is None:
+            return False
+        gain, known = there.believed.gain, there.correlation
+        variance = max(known.inflation, known.overall) * sigma**2
+        dof = 6 * max(int(self.free.sum()), 1)
+        return bool(gain @ known.S @ gain > dof * BENT**2 * variance)
+
+    def _unbent(self, level: Level, bend: NDArray[np.float64]) -> Level:
+        """Take the camera's fixed pattern (m,) off all points, in place of the present one.
+
+        Returns the level with its points likewise.
+        """
+        step = bend if self.bend is None else bend - self.bend
+        self.problem, self.bend = pattern.without(self.problem, step), bend
+        return replace(level, problem=pattern.without(level.problem, step))
+
     def _lay(
         self, spacing: float, poses: NDArray[np.float64], before: Map | None, last: bool
     ) -> tuple[Level, State, Linearisation]:
@@ -174,11 +202,12 @@ class Engine:
         heights = level_heights(
             level, before.heights if before else None, before.grid if before else None
         )
-        state, lin = solve_map(
-            level.problem, level.grid, State(poses, heights), level.loss, level.smooth,
-            self.workers, 1, NEAR,
-        )  # fmt: skip
-        return level, state, lin
+        return level, *self._map_solved(level, State(poses, heights))
+
+    def _map_solved(self, level: Level, state: State) -> tuple[State, Linearisation]:
+        return solve_map(
+            level.problem, level.grid, state, level.loss, level.smooth, self.workers, 1, NEAR
+        )
 
     def _descend(
         self, level: Level, state: State, lin: Linearisation, near: reduced.Reduction, phase: str,
@@ -200,11 +229,32 @@ class Engine:
             problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
         lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
         at = reduced.reduce(lin, self.workers, free=self.free)
+        believed = self._believed(problem, level.grid, state, loss, lin, at)
         found = certainty.correlation(
-            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at
+            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at, believed
         )
         self.clock.lap("certainty")
-        return Known(problem, lin, found)
+        return Known(problem, lin, found, believed)
+
+    def _believed(
+        self, problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation,
+        at: reduced.Reduction,
+    ) -> pattern.Believed | None:  # fmt: skip
+        """Return what the points say of the camera's fixed pattern; None: there is none."""
+        if not self.preset.pattern or problem.waves is None or not self.free.any():
+            return None
+        found = pattern.answers(
+            problem, grid, state, loss, lin, at, problem.waves, self.workers
+        )  # fmt: skip
+        now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
+        variance = robust_sigma(lin.residuals) ** 2
+        matrix, _ = self.acting.normal_equations(state.T_map_camera, lin.pivots)
+        # where the level ended data and measured poses balance: no gradient is left
+        believed = pattern.believe(
+            found, at.S + variance * matrix, np.zeros(len(at.S)), np.repeat(self.free, 6), now,
+            variance,
+        )  # fmt: skip
+        return believed if believed.strength or now.any() else None
 
     def _no_finer(
         self, levels: list[float], index: int, level: Level, outcome: Outcome,

@@ -32,6 +32,7 @@ from depthba.optimiser.problem import (
     typical_noise,
 )
 from depthba.optimiser.start import pose_sigmas
+from depthba.optimiser.waves import waves_of
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Result
@@ -204,6 +205,7 @@ class Registration:
             origin=self._sensor.origin,
             spacing=self._spacing,
             noise=self._typical if self._sensor.noise is not None else None,
+            waves=waves_of(self._sensor, self._typical),
         )
 
     def _engine(self, problem: Problem, free: NDArray[np.bool_]) -> Engine:

@@ -39,7 +39,8 @@ def collect(
 
     Rows ``first`` to ``last``. Adds the smoothing term, ``weight`` times the squared difference of
     neighbouring heights where both are ``smooth``, and returns its cost. Nodes that nothing touches
-    stay what they are: they get a diagonal of 1.
+    stay what they are: they get a diagonal of 1. Those that are touched and not smooth are damped:
+    a few strays alone would send them far off.
     """
     ny, nx = heights.shape
     cost = 0.0
@@ -73,6 +74,8 @@ def collect(
                 if y > 0 and smooth[y - 1, x]:
                     o += weight
                     g += weight * (heights[y, x] - heights[y - 1, x])
+            elif o > 0.0:
+                o += 2 * weight
             own[y, x] = o if o > 0.0 else 1.0
             right[y, x] = r
             up[y, x] = u

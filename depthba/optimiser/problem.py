@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.camera import RangeNoise
 from depthba.dataset import Dataset, Sensor
 from depthba.errors import DatasetError, OptionError
+from depthba.optimiser.waves import Waves, waves_of
 
 Roi = tuple[float, float, float, float, float, float]
 
@@ -69,6 +69,8 @@ class Problem:
     """Typical distance of neighbouring points on the surface, m."""
     noise: float | None
     """Standard deviation of the range at a point of weight 1, m, where the dataset states it."""
+    waves: Waves | None = None
+    """What a fixed pattern of the range can be made of; None: there is none."""
 
     def thinned(self, stride: int) -> Problem:
         """Return the problem with every ``stride``-th point of each frame."""
@@ -119,6 +121,7 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
         origin=dataset.sensor.origin,
         spacing=point_spacing(dataset.sensor, clouds),
         noise=typical if dataset.sensor.noise is not None else None,
+        waves=waves_of(dataset.sensor, typical),
     )
 
 
@@ -189,24 +192,16 @@ def crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDArr
     return np.ascontiguousarray(points[inside])
 
 
-def _sigma(noise: RangeNoise | None, points: NDArray[np.float32]) -> NDArray[np.float64]:
-    if noise is None:
-        return np.ones(len(points))
-    sigma = noise.sigma(points[:, 2].astype(float))
-    if noise.along == "z":  # an error of z moves the point along its ray by that much more
-        sigma = sigma * np.linalg.norm(points, axis=1) / np.maximum(points[:, 2], 1e-9)
-    return np.asarray(sigma)
-
-
 def typical_noise(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
     """Return the median standard deviation of the points' range, m; 1 where none is stated."""
-    sigmas = [_sigma(sensor.noise, p[:: max(1, len(p) // 2000)]) for p in clouds]
+    if sensor.noise is None:
+        return 1.0
+    sigmas = [sensor.noise.of_points(p[:: max(1, len(p) // 2000)]) for p in clouds]
     return float(np.median(np.concatenate(sigmas)))
 
 
 def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) -> FramePoints:
     """Wrap a cloud (n, 3) in the sensor frame; ``typical`` noise, m, gets the weight 1."""
-    weight = typical / _sigma(sensor.noise, points)
     n = len(points)
     if n == 0:
         return FramePoints(
@@ -214,7 +209,8 @@ def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) ->
         )
     weighted = np.ones((n, 5), np.float32)
     weighted[:, :3] = points
-    weighted[:, 3] = weight
+    if sensor.noise is not None:
+        weighted[:, 3] = typical / sensor.noise.of_points(points)
     centroid = points.mean(axis=0, dtype=float)
     extent = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
     return FramePoints(weighted, _blocks(points, sensor), centroid, extremes(points), extent)

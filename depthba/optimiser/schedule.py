@@ -40,16 +40,18 @@ class Preset:
     """Smoothing ties all nodes of the grid; else those near a seen one."""
     prior: bool
     """The measured poses enter as residuals."""
+    pattern: bool
+    """A fixed pattern of the camera is solved for."""
 
 
 PRESETS = {
     "paper": Preset(
         along_ray=False, slope=False, robust=0.0,
-        smoothing=0.1, relative=False, whole=True, prior=False,
+        smoothing=0.1, relative=False, whole=True, prior=False, pattern=False,
     ),
     "default": Preset(
         along_ray=True, slope=True, robust=3.5,
-        smoothing=1e-4, relative=True, whole=False, prior=True,
+        smoothing=1e-4, relative=True, whole=False, prior=True, pattern=True,
     ),
 }  # fmt: skip
 
@@ -57,7 +59,11 @@ PRESETS = {
 def preset_of(options: Options) -> Preset:
     """Return what the options' preset fixes."""
     preset = PRESETS[options.preset]
-    return preset if options.priors else replace(preset, prior=False)
+    return replace(
+        preset,
+        prior=preset.prior and options.priors,
+        pattern=preset.pattern and options.fixed_pattern,
+    )
 
 
 def check(options: Options) -> None:

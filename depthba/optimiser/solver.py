@@ -28,6 +28,10 @@ PACE = 0.5
 FOLLOW = 2
 # Tolerance of those solves.
 ROUGHLY = 1e-2
+# Shares of a step that are tried before it is turned down.
+SHORTER = (0.5, 0.2)
+# Steps whose gain may be spent on one that raises the cost, and by what factor at most.
+MEMORY, LEAP = 3, 1.01
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,8 @@ def solve_level(
     # a direction that goes back to its measured pose gives up what it had gained from noise
     unlearnt = 0.0 if sure is None else dof * max(temperature, sigma**2)
     mixer, pace, previous = Mixer(), PACE, np.inf
+    recent: list[float] = []
+    gained = 1.0
     for count in range(rules.limit):
         if count and over():
             break
@@ -176,8 +182,20 @@ def solve_level(
                 problem, grid, candidate, after, loss, smooth, workers, judge
             )
             after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
-        accepted = after_cost <= most
+        for share in SHORTER:
+            if after_cost <= most:
+                break
+            # damping shortens the poses' part alone; what the map does may be what goes too far
+            heights = state.heights + share * mixed.map
+            candidate = State(move(state.T_map_camera, lin.pivots, share * mixed.pose), heights)
+            after = linearise(problem, grid, candidate, loss, workers, smooth, judge, after)
+            after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+        # points that change cells or fall off edges make the cost rough on a small scale: what the
+        # last steps gained may be spent on getting over that (Grippo, Lampariello & Lucidi 1986)
+        accepted = after_cost <= max(most, before_cost * min(gained, LEAP))
         if accepted:
+            recent = [*recent, after_cost / before_cost][-MEMORY:]
+            gained = 1 / float(np.prod(recent))
             pace = min(max(0.5 * (pace + length / previous), 0.1), 0.9)
             previous = length
             mixer.took(mixed)
@@ -193,7 +211,8 @@ def solve_level(
                 damping = max(10 * damping, 1e-2)
             mixer.forget()
         report(Progress(state, lin, before_cost, step, damping, accepted, sigma))
-        if accepted and (small or before_cost - after_cost < rules.gain * before_cost):
+        enough = rules.gain > 0 and before_cost - after_cost < rules.gain * before_cost
+        if accepted and (small or enough):
             converged = True
             break
         if damping > 1e6:

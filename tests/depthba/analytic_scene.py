@@ -72,12 +72,14 @@ def write_scene(
     map_frame: str = "world",
     shift: dict[int, Floats] | None = None,
     empty: Iterable[int] = (),
+    bend: Floats | None = None,
 ) -> Dataset:
     """Write a dataset of the surface.
 
     ``noise`` is a deviation along the ray, m; the measured poses are off by SIGMA_T, SIGMA_R per
     axis; ``T_new_world`` tells everything in another world frame; ``shift`` moves a frame's
-    measured pose, m; the frames in ``empty`` measured nothing.
+    measured pose, m; the frames in ``empty`` measured nothing; ``bend`` (HEIGHT, WIDTH), m, is an
+    error of the range that all frames share.
     """
     rng = np.random.default_rng(seed)
     T_true = cameras(frames, rng)
@@ -103,6 +105,8 @@ def write_scene(
     for i in range(frames):
         depth = ray_cast(T_true[i], surface)
         depth = depth + noise * rng.standard_normal(depth.shape) * along_ray
+        if bend is not None:
+            depth = depth + bend * along_ray
         if i in empty:
             depth = np.full_like(depth, np.nan)
         measured = T_measured[i].copy()

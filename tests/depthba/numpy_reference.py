@@ -189,6 +189,9 @@ def normal_equations(
         factors.append(smoothing)
         cost += smoothing * (flat[one] - flat[other]) ** 2
     J, r, w = np.array(rows), np.array(values), np.array(factors)
-    return Dense(
-        J.T @ (w[:, None] * J), J.T @ (w * r), cost, used, tuple(weights), tuple(residuals)
-    )
+    H = J.T @ (w[:, None] * J)
+    # what nothing ties to its neighbours is damped, where there is anything at all
+    loose = 6 * frames + np.flatnonzero(~smooth.ravel())
+    loose = loose[np.diag(H)[loose] > 0]
+    H[loose, loose] += 2 * smoothing
+    return Dense(H, J.T @ (w * r), cost, used, tuple(weights), tuple(residuals))
