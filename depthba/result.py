@@ -124,6 +124,9 @@ class Result:
     """Per stage."""
     overlap: NDArray[np.float64]
     """(N, N), share of frame i's cells that frame j sees too."""
+    fixed_pattern: float = 0.0
+    """Error of the range that all frames share, m: root mean square over the image, at a point of
+    typical noise. It was found along with the poses and taken off; 0: there is none."""
 
     @property
     def trusted(self) -> bool:

@@ -213,6 +213,7 @@ def summary(result: Result, options: Options, dataset: Dataset) -> dict[str, Any
         "seconds": result.seconds,
         "sigma": result.sigma,
         "inflation": result.inflation,
+        "fixed_pattern": result.fixed_pattern,
         "dataset": {
             "path": str(Path(dataset.path).resolve()),
             "name": dataset.name,

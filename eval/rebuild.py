@@ -82,6 +82,7 @@ def archived_result(run: Run, dataset: Dataset) -> Result:
             covariance=np.zeros((6 * n, 6 * n)) if run.covariance is None else run.covariance,
             sigma=_number(told["sigma"]),
             inflation=_number(told["inflation"]),
+            fixed_pattern=_number(told.get("fixed_pattern", 0.0)),
             history=(),
             weak=tuple(_weak(w) for w in told["weak"]),
             frames=tuple(FrameReport(**f) for f in told["frames"]),

@@ -90,4 +90,5 @@ def conclude(
         frames=frames,
         seconds={**engine.clock.stages, "total": engine.clock.elapsed},
         overlap=overlap,
+        fixed_pattern=engine.fixed_pattern,
     )

@@ -114,6 +114,12 @@ class Engine:
             return self.prior
         return replace(self.prior, information=0 * self.prior.information)
 
+    @property
+    def fixed_pattern(self) -> float:
+        """Root mean square over the image of what has been taken off the points, m."""
+        waves = self.problem.waves
+        return 0.0 if self.bend is None or waves is None else waves.size(self.bend)
+
     def run(
         self,
         levels: list[float],

@@ -62,15 +62,17 @@ class Waves:
         """Return (n, m) at places in the image (n,), 0 to 1; root mean square 1 over the image."""
         return (_cosines(u, v, self.orders) - _plain(u, v) @ self.plain) / self.rms
 
+    def size(self, pattern: Array) -> float:
+        """Return the root mean square over the image of a pattern (m,), in its unit."""
+        return float(np.sqrt(np.mean((self.over_image(*_small_image()) @ pattern) ** 2)))
+
 
 def waves_of(sensor: Sensor, typical: float) -> Waves | None:
     """Return the waves of a sensor with ``typical`` noise, m; None where its rays are not known."""
     camera = sensor.camera
     if camera is None or not sensor.origin:
         return None
-    # the pixels' centres of a small image stand for all in finding constant and slope
-    grid = [(np.arange(8 * n) + 0.5) / (8 * n) for n in FINEST]
-    u, v = (a.ravel() for a in np.meshgrid(*grid))
+    u, v = _small_image()
     orders = np.indices([n + 1 for n in FINEST]).reshape(2, -1)
     orders = orders[:, (orders / np.array(FINEST)[:, None]).sum(axis=0) <= 1]
     raw = _cosines(u, v, orders)
@@ -87,6 +89,13 @@ def waves_of(sensor: Sensor, typical: float) -> Waves | None:
         noise=sensor.noise,
         typical=typical,
     )
+
+
+def _small_image() -> tuple[Array, Array]:
+    """Return the pixels' centres (n,) of a small image, 0 to 1: they stand for those of any."""
+    grid = [(np.arange(8 * n) + 0.5) / (8 * n) for n in FINEST]
+    u, v = np.meshgrid(*grid)
+    return u.ravel(), v.ravel()
 
 
 def _cosines(u: Array, v: Array, orders: NDArray[np.int_]) -> Array:

@@ -153,6 +153,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "largest_move_m": max((frame.move_t for frame in result.frames), default=0.0),
         "largest_move_rad": max((frame.move_r for frame in result.frames), default=0.0),
         "sigma_m": result.sigma,
+        "fixed_pattern_m": result.fixed_pattern,
         "spacing_m": result.depth_map.spacing,
         "weak": [
             {
@@ -187,6 +188,11 @@ def report(name: str, outcome: Outcome, most: int = 6) -> list[str]:
             f"{angle(turned.move_r)} (frame {turned.frame})"
         )
     lines.append(f"  sigma         {length(result.sigma)} of the residuals")
+    if result.fixed_pattern:
+        lines.append(
+            f"  pattern       {length(result.fixed_pattern)} rms of the range, the same in every "
+            "frame, found and taken off"
+        )
     lines += _first(
         "weak",
         [

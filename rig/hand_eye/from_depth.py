@@ -203,7 +203,7 @@ def _estimate(
         previous = level.grid
     steady = without_bends(level.problem, level.grid, descent.heights, chain.T_map_camera, SHARP)
     level = replace(level, problem=steady)
-    waves = waves_of(level.problem, dataset.sensor)
+    waves = waves_of(level.problem)
     noise = options.robot_noise
     stated = Beliefs(sigma, ZERO, noise[0], float(np.radians(noise[1])), PATTERN)
     return solve(level, descent, waves, start, stated, workers, report), levels[-1], start

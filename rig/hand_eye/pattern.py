@@ -1,9 +1,7 @@
 """A fixed pattern of the camera: an error of the range that is the same in every frame.
 
 It moves the scene alike in front of every camera, and so does a wrong hand-eye transform. The
-pattern is therefore an unknown, a sum of cosine waves over the image as fine as the blocks over
-which residuals are taken to be correlated. A constant and a slope are left out: they are a part of
-where the camera says that it is.
+pattern is therefore an unknown, a sum of the waves of :mod:`depthba.optimiser.waves`.
 """
 
 from __future__ import annotations
@@ -13,11 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.dataset import Sensor
 from depthba.optimiser import coupling
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
-from depthba.optimiser.problem import BLOCKS, Problem
+from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import Workers
 
 Array = NDArray[np.float64]
@@ -54,43 +51,11 @@ class Waves:
         return replace(problem, frames=tuple(frames))
 
 
-def waves_of(problem: Problem, sensor: Sensor) -> Waves:
+def waves_of(problem: Problem) -> Waves:
     """Return the waves at the points of a problem; none where the rays are not known."""
-    camera = sensor.camera
-    if camera is None or not sensor.origin:
+    if problem.waves is None:
         return Waves(tuple(np.zeros((len(f), 0), np.float32) for f in problem.frames))
-    columns, rows = BLOCKS
-    # the pixels' centres of a small image stand for all in finding constant and slope
-    grid = [(np.arange(8 * n) + 0.5) / (8 * n) for n in (columns, rows)]
-    across, down = (a.ravel() for a in np.meshgrid(*grid))
-    plain = np.stack([np.ones_like(across), across - 0.5, down - 0.5], axis=1)
-    raw = _cosines(across, down)
-    taken = np.linalg.lstsq(plain, raw, rcond=None)[0]
-    rms = np.sqrt(np.mean((raw - plain @ taken) ** 2, axis=0))
-    keep = rms > 0.2
-    found = []
-    for frame in problem.frames:
-        p = frame.points.astype(float)
-        u = (p[:, 0] / p[:, 2] * camera.fx + camera.cx + 0.5) / camera.width
-        v = (p[:, 1] / p[:, 2] * camera.fy + camera.cy + 0.5) / camera.height
-        plain = np.stack([np.ones_like(u), u - 0.5, v - 0.5], axis=1)
-        wave = (_cosines(u, v) - plain @ taken)[:, keep] / rms[keep]
-        if sensor.noise is not None and problem.noise:
-            wave *= sensor.noise.sigma(p[:, 2:3]) / problem.noise
-        found.append(wave.astype(np.float32))
-    return Waves(tuple(found))
-
-
-def _cosines(u: Array, v: Array) -> Array:
-    """Return (n, m) cosines, u and v from 0 to 1.
-
-    At most as many half waves as there are blocks, both ways taken together.
-    """
-    columns, rows = BLOCKS
-    across = np.cos(np.pi * u[:, None] * np.arange(columns))
-    down = np.cos(np.pi * v[:, None] * np.arange(rows))
-    k, j = np.nonzero(np.add.outer(np.arange(columns) / columns, np.arange(rows) / rows) < 1)
-    return np.asarray(across[:, k] * down[:, j])
+    return Waves(tuple(problem.waves.at(f.points) for f in problem.frames))
 
 
 @dataclass(frozen=True)
