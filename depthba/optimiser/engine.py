@@ -163,7 +163,9 @@ class Engine:
             finer = self._finer(level.grid.spacing, known, outcome)
             less = known.inflation < LESS * believed
             bent = self._bent(there, outcome.sigma)
-            if not outcome.converged or not (less or bent or finer < level.grid.spacing):
+            # a pattern may be what keeps the poses from settling
+            more = bent or (outcome.converged and (less or finer < level.grid.spacing))
+            if self.clock.over or not more:
                 return End(level, outcome, temperature, there)
             # poses that had not settled had made the residuals look more alike than they are
             believed, state, lin = known.inflation, outcome.state, outcome.lin
