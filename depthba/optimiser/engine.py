@@ -46,6 +46,8 @@ CLEARLY = 0.9
 AGAIN = 4
 # It goes on when their inflation has come out below this share of what was believed.
 LESS = 0.8
+# Every how-manieth point is asked first whether there is a fixed pattern at all.
+FEW = 8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
 BENT = 0.3
 
@@ -251,18 +253,22 @@ class Engine:
         """Return what the points say of the camera's fixed pattern; None: there is none."""
         if not self.preset.pattern or problem.waves is None or not self.free.any():
             return None
-        found = pattern.answers(
-            problem, grid, state, loss, lin, at, problem.waves, self.workers
-        )  # fmt: skip
         now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
         variance = robust_sigma(lin.residuals) ** 2
         matrix, _ = self.acting.normal_equations(state.T_map_camera, lin.pivots)
         # where the level ended data and measured poses balance: no gradient is left
-        believed = pattern.believe(
-            found, at.S + variance * matrix, np.zeros(len(at.S)), np.repeat(self.free, 6), now,
-            variance,
-        )  # fmt: skip
-        return believed if believed.strength or now.any() else None
+        held, none = at.S + variance * matrix, np.zeros(len(at.S))
+        believed = None
+        for stride in (FEW, 1) if self.bend is None else (1,):
+            found = pattern.answers(
+                problem, grid, state, loss, lin, at, problem.waves, self.workers, stride
+            )
+            believed = pattern.believe(
+                found, held, none, np.repeat(self.free, 6), now, stride * variance
+            )
+            if self.bend is None and not believed.strength:
+                return None
+        return believed
 
     def _no_finer(
         self, levels: list[float], index: int, level: Level, outcome: Outcome,

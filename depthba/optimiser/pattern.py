@@ -103,6 +103,7 @@ def answers(
     at: Reduction,
     waves: Waves,
     workers: Workers,
+    stride: int = 1,
 ) -> Answers:
     """Set up the normal equations of the pattern and eliminate the map from them.
 
@@ -115,6 +116,7 @@ def answers(
         at: its map eliminated.
         waves: what the pattern is made of.
         workers: the threads.
+        stride: every how-manieth point stands for as many: what they say then varies as much more.
     """
     m, count = len(waves), len(problem.frames)
     ground = Ground(problem, grid, state, loss)
@@ -123,8 +125,8 @@ def answers(
 
     def part(i: int) -> tuple[Feet, Share]:
         # errors of the range move points against their residual's change: hence the minus signs
-        frame, feet = problem.frames[i], ground.feet(i)
-        share = share_of(frame, feet, lin.weights[i], waves)
+        frame, feet = problem.frames[i].thinned(stride), ground.feet(i, stride)
+        share = share_of(frame, feet, stride * lin.weights[i][::stride], waves)
         pull = share.weight * share.change
         J = _jacobian(feet, state.T_map_camera[i, :3, 3] - lin.pivots[i])
         cross[i] = -np.where(share.weight > 0, J * pull, 0.0).astype(np.float32) @ share.waves
