@@ -46,8 +46,6 @@ CLEARLY = 0.9
 AGAIN = 4
 # It goes on when their inflation has come out below this share of what was believed.
 LESS = 0.8
-# Every how-manieth point is asked first whether there is a fixed pattern at all.
-FEW = 8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
 BENT = 0.3
 
@@ -103,6 +101,8 @@ class Engine:
     history: list[Iteration] = field(default_factory=list)
     bend: NDArray[np.float64] | None = None
     """(m,), m at a point of typical noise: what has been taken off the points; None: nothing."""
+    plain: bool = False
+    """Whether the camera was found to have no fixed pattern: it is not looked for again."""
 
     @property
     def preset(self) -> schedule.Preset:
@@ -251,23 +251,20 @@ class Engine:
         at: reduced.Reduction,
     ) -> pattern.Believed | None:  # fmt: skip
         """Return what the points say of the camera's fixed pattern; None: there is none."""
-        if not self.preset.pattern or problem.waves is None or not self.free.any():
+        if self.plain or not self.preset.pattern or problem.waves is None or not self.free.any():
             return None
         now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
         variance = robust_sigma(lin.residuals) ** 2
         matrix, _ = self.acting.normal_equations(state.T_map_camera, lin.pivots)
         # where the level ended data and measured poses balance: no gradient is left
         held, none = at.S + variance * matrix, np.zeros(len(at.S))
-        believed = None
-        for stride in (FEW, 1) if self.bend is None else (1,):
-            found = pattern.answers(
-                problem, grid, state, loss, lin, at, problem.waves, self.workers, stride
-            )
-            believed = pattern.believe(
-                found, held, none, np.repeat(self.free, 6), now, stride * variance
-            )
-            if self.bend is None and not believed.strength:
-                return None
+        found = pattern.answers(problem, grid, state, loss, lin, at, problem.waves, self.workers)
+        believed = pattern.believe(
+            found, held, none, np.repeat(self.free, 6), now, pattern.CAUTION * variance
+        )
+        if self.bend is None and not believed.strength:
+            self.plain = True
+            return None
         return believed
 
     def _no_finer(

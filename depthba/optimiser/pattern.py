@@ -103,7 +103,6 @@ def answers(
     at: Reduction,
     waves: Waves,
     workers: Workers,
-    stride: int = 1,
 ) -> Answers:
     """Set up the normal equations of the pattern and eliminate the map from them.
 
@@ -116,7 +115,6 @@ def answers(
         at: its map eliminated.
         waves: what the pattern is made of.
         workers: the threads.
-        stride: every how-manieth point stands for as many: what they say then varies as much more.
     """
     m, count = len(waves), len(problem.frames)
     ground = Ground(problem, grid, state, loss)
@@ -125,8 +123,8 @@ def answers(
 
     def part(i: int) -> tuple[Feet, Share]:
         # errors of the range move points against their residual's change: hence the minus signs
-        frame, feet = problem.frames[i].thinned(stride), ground.feet(i, stride)
-        share = share_of(frame, feet, stride * lin.weights[i][::stride], waves)
+        frame, feet = problem.frames[i], ground.feet(i)
+        share = share_of(frame, feet, lin.weights[i], waves)
         pull = share.weight * share.change
         J = _jacobian(feet, state.T_map_camera[i, :3, 3] - lin.pivots[i])
         cross[i] = -np.where(share.weight > 0, J * pull, 0.0).astype(np.float32) @ share.waves
@@ -240,9 +238,8 @@ def believe(
         gradient: (6N,), likewise.
         keep: (6N,), the poses that move.
         now: (m,) the present pattern.
-        variance: m^2, of a residual.
+        variance: m^2, of a residual, with what makes up for its errors not being independent.
     """
-    variance *= CAUTION
     cross = found.cross[keep]
     S = held[np.ix_(keep, keep)]
     S = S + np.diag(1e-9 * np.diag(S) + 1e-300)

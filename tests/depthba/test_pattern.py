@@ -157,11 +157,11 @@ def test_the_strength_is_that_of_the_waves() -> None:
     rng = np.random.default_rng(0)
     own = np.diag(np.geomspace(1e6, 1e10, 60))
     bend = 0.003 * rng.standard_normal(60)
-    variance = pattern.CAUTION
+    variance = 12.0
     call = own @ bend + np.sqrt(variance * np.diag(own)) * rng.standard_normal(60)
     found = pattern.Answers(own, np.zeros((6, 60)), -call, np.zeros((1, 1, 60), np.float32))
     keep = np.ones(6, bool)
-    believed = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), 1.0)
+    believed = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), variance)
     assert believed.strength == pytest.approx(0.003, rel=0.3)
     error = believed.pattern - bend
     normalised = error[-30:] ** 2 * np.diag(own)[-30:] / variance
@@ -169,7 +169,7 @@ def test_the_strength_is_that_of_the_waves() -> None:
     # noise alone
     call = np.sqrt(variance * np.diag(own)) * rng.standard_normal(60)
     found = replace(found, gradient=-call)
-    none = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), 1.0)
+    none = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), variance)
     assert none.strength == 0.0
     assert_array_equal(none.pattern, 0.0)
     assert_array_equal(none.inverse, 0.0)
