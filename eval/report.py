@@ -295,9 +295,10 @@ def _facts(judged: Evaluation) -> str:
     run, options = judged.run.result, judged.run.config
     stages = ", ".join(f"{k} {three_digits(v)} s" for k, v in run["seconds"].items())
     noise = (
-        f"{_mm(run['sigma'])}; inflation of the covariance by correlation {run['inflation']:.3g}; "
-        f"fixed pattern of the camera {_mm(run.get('fixed_pattern', 0.0))} rms, taken off"
+        f"{_mm(run['sigma'])}; inflation of the covariance by correlation {run['inflation']:.3g}"
     )
+    if run.get("fixed_pattern"):
+        noise += f"; fixed pattern of the camera {_mm(run['fixed_pattern'])} rms, taken off"
     rows = [
         ["Dataset", f"{judged.dataset.name}, {len(judged.run.stamps)} frames"],
         ["Preset", str(options.get("preset"))],

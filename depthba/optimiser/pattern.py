@@ -2,9 +2,9 @@
 
 A pattern moves the scene alike in front of every camera: frames that look at one place from
 different sides cannot be made to agree, and lean to where they disagree least. Its waves are
-unknowns like the poses. Map and poses are eliminated from their normal equations; how strong the
-waves are is found along with them (empirical Bayes by expectation-maximisation, Dempster, Laird &
-Rubin 1977), so that a camera without a pattern gets none.
+unknowns like the poses. Map and poses are eliminated from their normal equations; their strength
+is what makes the data most probable (empirical Bayes, MacKay 1992), so that a camera without a
+pattern gets none.
 """
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
