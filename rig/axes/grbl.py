@@ -272,7 +272,7 @@ class GrblGantry:
         said: list[str] = []
         with self._lock:
             link = self._open()
-            link.send(text.encode("ascii") + b"\n")
+            self._tell(link, text.encode("ascii") + b"\n")
             deadline = time.monotonic() + timeout
             while (line := self._heard(link, deadline)) is not None:
                 if line == "ok":
@@ -288,7 +288,7 @@ class GrblGantry:
     def _report(self) -> Report:
         with self._lock:
             link = self._open()
-            link.send(_REPORT)
+            self._tell(link, _REPORT)
             deadline = time.monotonic() + self._options.reply_timeout
             while (line := self._heard(link, deadline)) is not None:
                 self._note_alarm(line)
@@ -301,6 +301,14 @@ class GrblGantry:
             raise AxesError(
                 f"{self._who}: no status report within {self._options.reply_timeout:g} s"
             )
+
+    def _tell(self, link: SerialLink, data: bytes) -> None:
+        """Write; a lost link is closed."""
+        try:
+            link.send(data)
+        except AxesError:
+            self.disconnect()
+            raise
 
     def _heard(self, link: SerialLink, deadline: float) -> str | None:
         """Return the next line; a lost link is closed, a restart of the controller is an error."""

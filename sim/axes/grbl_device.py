@@ -84,7 +84,8 @@ class GrblDevice:
             else:
                 self._buffer += chr(byte)
         while self._lines and not self._homing and self._state != "halted":
-            self._out += self._obey(self._lines.pop(0), now)
+            said = self._obey(self._lines.pop(0), now)  # an alarm goes out before it
+            self._out += said
         out, self._out = self._out, ""
         return out.encode("ascii")
 

@@ -34,7 +34,7 @@ def run(kind: type[Options], serve: Callable[[Options], None]) -> None:
     """Parse the command line into options and serve; a known error is one line and status 1."""
     import tyro
 
-    options = tyro.cli(kind, config=(tyro.conf.OmitArgPrefixes,))
+    options = tyro.cli(kind)
     try:
         serve(options)
     except KeyboardInterrupt:
