@@ -5,6 +5,7 @@ connect, so that this package needs neither.
 """
 
 from rig.axes.axes import Axes, AxesState, Axis
+from rig.axes.finding import make
 from rig.axes.grbl import GrblGantry, GrblOptions
 from rig.axes.limits import check_speed, check_target
 from rig.axes.modbus import ModbusGantry, ModbusOptions
@@ -23,4 +24,5 @@ __all__ = [
     "RegisterMap",
     "check_speed",
     "check_target",
+    "make",
 ]

@@ -244,7 +244,7 @@ class GrblGantry:
             link.drain()
             link.send(_RESET)
             deadline = time.monotonic() + self._options.connect_timeout
-            self._held, self._alarm = False, None
+            self._held = False
             while (line := link.line(deadline)) is not None:
                 self._note_alarm(line)
                 if line.startswith("Grbl"):

@@ -31,7 +31,8 @@ FAST = ("--rate", "8")
 @contextmanager
 def gantry(*words: str, home: bool = True) -> Iterator[GrblGantry]:
     with peer("sim.axes.grbl_device", *(words or FAST)) as (_, port):
-        found = GrblGantry(GrblOptions(port, AXES, origin=ORIGIN, patience=PATIENT))
+        options = GrblOptions(port, AXES, origin=ORIGIN, patience=PATIENT, reply_timeout=2.0)
+        found = GrblGantry(options)
         found.connect()
         if home:
             found.home()
@@ -138,7 +139,7 @@ def test_refuses_targets_before_they_leave() -> None:
     [
         ("stall", r"stuck: no nearer for 1 s at x 0\.[0-3]\d* m"),
         ("alarm", r"hard limit: a switch was hit, the position is lost \(ALARM:1\)"),
-        ("silent", "no status report within 1 s"),
+        ("silent", "no status report within 2 s"),
         ("drop", "the connection was lost"),
     ],
 )
@@ -148,7 +149,9 @@ def test_faults_of_a_move_end_in_one_line(kind: str, words: str) -> None:
             axes.move_to([0.4, 0.4], speed=0.4)
         assert "\n" not in str(caught.value)
         if kind in ("stall", "alarm"):
-            assert axes.status().homed == (kind == "stall")
+            state = axes.status()
+            assert state.homed == (kind == "stall")
+            assert (state.alarm is not None and "hard limit" in state.alarm) == (kind == "alarm")
             axes.home()
             axes.move_to([0.1, 0.1], speed=0.4)
         else:

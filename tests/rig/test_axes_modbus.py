@@ -17,7 +17,8 @@ import pytest
 
 pytest.importorskip("pymodbus", reason="the extra rig is not installed")
 
-from rig.axes import Axes, Axis, ModbusGantry, ModbusOptions, Patience, RegisterMap
+from depthba.errors import OptionError
+from rig.axes import Axes, Axis, ModbusGantry, ModbusOptions, Patience, RegisterMap, make
 from rig.errors import AxesError
 from tests.rig.peers import ends_in_time, loopback, peer, silent_listener, unreachable
 
@@ -31,7 +32,8 @@ def gantry(*words: str, home: bool = True) -> Iterator[ModbusGantry]:
     words = ("--host", loopback(), "--port", "0", *(words or FAST))
     with peer("sim.axes.modbus_device", *words) as (_, where):
         host, port = where.split(":")
-        found = ModbusGantry(ModbusOptions(host, AXES, port=int(port), patience=PATIENT))
+        options = ModbusOptions(host, AXES, port=int(port), patience=PATIENT, reply_timeout=2.0)
+        found = ModbusGantry(options)
         found.connect()
         if home:
             found.home()
@@ -123,7 +125,7 @@ def test_refuses_targets_before_they_leave() -> None:
     [
         ("stall", r"stuck: no nearer for 1 s at x 0\.[0-3]\d* m"),
         ("alarm", r"alarm during the move: limit switch \(code 2\), at x"),
-        ("silent", "no answer for .* within 1 s"),
+        ("silent", "no answer for .* within 2 s"),
         ("drop", "the connection was lost"),
     ],
 )
@@ -210,8 +212,53 @@ def test_another_map_and_a_controller_without_it() -> None:
         swapped.disconnect()
 
 
+def test_ctrl_c_brakes() -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        pytest.skip("signals come to the main thread alone")
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        with gantry("--watchdog", "20", "--rate", "2") as axes:
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            with pytest.raises(KeyboardInterrupt):
+                axes.move_to([0.8, 0.6], speed=0.1)
+            time.sleep(0.2)
+            state = axes.status()
+            assert not state.moving
+            assert state.position[0] < 0.8
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_axes_are_made_from_plain_values() -> None:
+    axes = [
+        {"name": "x", "lower": 0, "upper": 0.8, "speed": 0.5},
+        {"name": "y", "lower": 0, "upper": 0.6, "speed": 0.4},
+    ]
+    values = {"host": "127.0.0.1", "axes": axes, "patience": {"stall": 2}}
+    made = make("modbus", values)
+    assert isinstance(made, ModbusGantry)
+    assert made._options == ModbusOptions("127.0.0.1", AXES, patience=Patience(stall=2.0))
+    assert make("grbl", {"port": "/dev/x", "axes": axes}).axes == AXES
+    for name, changed, words in (
+        ("plc", {}, "unknown axes 'plc'; choose from: grbl, modbus"),
+        ("modbus", {"speed": 1}, "axes 'modbus': unknown option 'speed'; choose from: axes, conn"),
+        (
+            "modbus",
+            {"axes": [{"name": "x"}]},
+            r"axes 'modbus': axes\[0\]: option 'lower' is missing",
+        ),
+        ("modbus", {"port": "high"}, "option 'port' is 'high', expected int"),
+        ("modbus", {"registers": {"word_order": "odd"}}, "registers: option 'word_order' is 'odd'"),
+    ):
+        with pytest.raises(OptionError, match=words):
+            make(name, values | changed)
+
+
 def test_the_device_listens_on_loopback_only() -> None:
-    from depthba.errors import OptionError
     from sim.axes.serving import check_loopback
 
     check_loopback("127.3.4.5")
