@@ -24,7 +24,9 @@ from tests.rig.peers import ends_in_time, loopback, peer, silent_listener, unrea
 
 AXES = (Axis("x", 0.0, 0.8, 0.5), Axis("y", 0.0, 0.6, 0.4))
 PATIENT = Patience(stall=1.0, settle=1.0)
-FAST = ("--rate", "8", "--watchdog", "20")
+NEAR = ("--mechanics.parked", "0.03", "0.02")
+"""Close to the switches, so that homing takes little."""
+FAST = (*NEAR, "--rate", "8", "--watchdog", "20")
 
 
 @contextmanager
@@ -75,7 +77,7 @@ def test_homes_moves_stops_and_comes_back() -> None:
 
 
 def test_moves_in_a_straight_line_and_brakes_when_told() -> None:
-    with gantry("--watchdog", "20") as axes:
+    with gantry("--watchdog", "20", *NEAR) as axes:
         seen: list[np.ndarray] = []
         told = threading.Event()
 
@@ -157,12 +159,12 @@ def test_homing_that_finds_no_switch() -> None:
 
 
 def test_nobody_there_refused_and_silent() -> None:
-    options = ModbusOptions(loopback(), AXES)
+    options = ModbusOptions(loopback(), AXES, connect_timeout=1.0)
     with socket.create_server((loopback(), 0)) as server:
         closed = server.getsockname()[1]
-    with ends_in_time(), pytest.raises(AxesError, match="no connection within 2 s"):
+    with ends_in_time(), pytest.raises(AxesError, match="no connection within 1 s"):
         ModbusGantry(replace(options, port=closed)).connect()
-    for place, words in ((unreachable, "no connection within 2 s"), (silent_listener, "no answer")):
+    for place, words in ((unreachable, "no connection within 1 s"), (silent_listener, "no answer")):
         with place() as (host, port):
             axes = ModbusGantry(replace(options, host=host, port=port))
             with ends_in_time(), pytest.raises(AxesError, match=words):
@@ -172,7 +174,7 @@ def test_nobody_there_refused_and_silent() -> None:
 
 def test_a_frozen_controller_and_a_client_that_dies() -> None:
     """The link is up, but nobody is behind it: each side ends the move by itself."""
-    words = ("--host", loopback(), "--port", "0", "--watchdog", "1.5")
+    words = ("--host", loopback(), "--port", "0", "--watchdog", "1.5", *NEAR)
     with peer("sim.axes.modbus_device", *words) as (process, where):
         host, port = where.split(":")
         axes = ModbusGantry(ModbusOptions(host, AXES, port=int(port), patience=PATIENT))
@@ -220,8 +222,8 @@ def test_ctrl_c_brakes() -> None:
         pytest.skip("signals come to the main thread alone")
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
-        with gantry("--watchdog", "20", "--rate", "2") as axes:
-            signal.setitimer(signal.ITIMER_REAL, 0.5)
+        with gantry("--watchdog", "20", *NEAR) as axes:
+            signal.setitimer(signal.ITIMER_REAL, 0.3)
             with pytest.raises(KeyboardInterrupt):
                 axes.move_to([0.8, 0.6], speed=0.1)
             time.sleep(0.2)
