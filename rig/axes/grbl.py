@@ -57,7 +57,7 @@ class GrblGantry:
     """`rig.axes.axes.Axes` on a GRBL 1.1 controller with homing ($22=1).
 
     The stamp of a state is the host's clock when its report arrived. Threads may share one; `stop`
-    waits for nobody.
+    waits for nobody, `status` for an answer, or until homing has ended.
     """
 
     def __init__(self, options: GrblOptions):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -81,14 +82,10 @@ class ModbusGantry:
         self.disconnect()
         options = self._options
         client = ModbusTcpClient(
-            options.host, port=options.port, timeout=options.connect_timeout, retries=0
+            options.host, port=options.port, timeout=options.reply_timeout, retries=0
         )
-        if not client.connect():
-            raise AxesError(
-                f"{self._who}: no connection within {options.connect_timeout:g} s,"
-                " expected a Modbus TCP controller there"
-            )
-        client.comm_params.timeout_connect = options.reply_timeout  # of a reply, from here on
+        # its own connect() keeps the reason of a failure to itself
+        client.socket = self._connected()
         with self._lock:
             self._client = client
             # the controller may remember a number from an earlier client
@@ -177,6 +174,19 @@ class ModbusGantry:
     @property
     def _who(self) -> str:
         return f"gantry {self._options.host}:{self._options.port}"
+
+    def _connected(self) -> socket.socket:
+        options = self._options
+        try:
+            return socket.create_connection((options.host, options.port), options.connect_timeout)
+        except TimeoutError as error:
+            reason: object = f"nobody answers within {options.connect_timeout:g} s"
+            cause: OSError = error
+        except ConnectionRefusedError as error:
+            reason, cause = "the connection is refused", error
+        except OSError as error:
+            reason, cause = f"no connection: {error.strerror or error}", error
+        raise AxesError(f"{self._who}: {reason}, expected a Modbus TCP controller there") from cause
 
     def _command(
         self, code: int, operands: list[tuple[int, int]] | None = None, unless: int | None = None

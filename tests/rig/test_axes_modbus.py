@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -20,7 +22,7 @@ pytest.importorskip("pymodbus", reason="the extra rig is not installed")
 from depthba.errors import OptionError
 from rig.axes import Axes, Axis, ModbusGantry, ModbusOptions, Patience, RegisterMap, make
 from rig.errors import AxesError
-from tests.rig.peers import ends_in_time, loopback, peer, silent_listener, unreachable
+from tests.rig.peers import ROOT, ends_in_time, loopback, peer, silent_listener, unreachable
 
 AXES = (Axis("x", 0.0, 0.8, 0.5), Axis("y", 0.0, 0.6, 0.4))
 PATIENT = Patience(stall=1.0, settle=1.0)
@@ -162,9 +164,15 @@ def test_nobody_there_refused_and_silent() -> None:
     options = ModbusOptions(loopback(), AXES, connect_timeout=1.0)
     with socket.create_server((loopback(), 0)) as server:
         closed = server.getsockname()[1]
-    with ends_in_time(), pytest.raises(AxesError, match="no connection within 1 s"):
+    with (
+        ends_in_time(),
+        pytest.raises(AxesError, match="the connection is refused, expected a Mod"),
+    ):
         ModbusGantry(replace(options, port=closed)).connect()
-    for place, words in ((unreachable, "no connection within 1 s"), (silent_listener, "no answer")):
+    for place, words in (
+        (unreachable, "nobody answers within 1 s"),
+        (silent_listener, "no answer"),
+    ):
         with place() as (host, port):
             axes = ModbusGantry(replace(options, host=host, port=port))
             with ends_in_time(), pytest.raises(AxesError, match=words):
@@ -267,3 +275,13 @@ def test_the_device_listens_on_loopback_only() -> None:
     for host in ("0.0.0.0", "192.168.1.4", "localhost", "", "::"):
         with pytest.raises(OptionError, match="expected a loopback address"):
             check_loopback(host)
+    ended = subprocess.run(
+        [sys.executable, "-m", "sim.axes.modbus_device", "--host", "0.0.0.0"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.startswith("host '0.0.0.0', expected a loopback address")
+    assert ended.stderr.count("\n") == 1
