@@ -55,6 +55,7 @@ class GrblDevice:
         self.options = options
         self.carriage = Carriage(options.mechanics)
         self._travel = 1e3 * np.array(options.mechanics.upper)
+        self._shift = np.zeros_like(self._travel)  # of the machine's frame, mm; known once homed
         self._buffer = ""
         self._lines: list[str] = []
         self._state: Literal["idle", "alarm", "halted"] = "alarm" if options.homing else "idle"
@@ -104,7 +105,7 @@ class GrblDevice:
                 self.carriage.alarm = None
                 self._halt(9)
             else:
-                self._state = "idle"
+                self._state, self._shift = "idle", -self._travel
                 self._out += "ok\r\n"
 
     def _halt(self, alarm: int) -> None:
@@ -139,9 +140,7 @@ class GrblDevice:
         if self._state != "idle":
             state = "Alarm"
         machine = np.zeros(3)
-        machine[: len(self._travel)] = 1e3 * self.carriage.position(now)
-        if self.carriage.homed:
-            machine[: len(self._travel)] -= self._travel
+        machine[: len(self._travel)] = 1e3 * self.carriage.position(now) + self._shift
         offset = np.array(self.options.work_offset)
         work = self.options.report == "work"
         shown = machine - offset if work else machine
@@ -191,7 +190,7 @@ class GrblDevice:
             return "ok\r\n"
         if self._feed <= 0:
             return "error:22\r\n"
-        target = 1e3 * self.carriage.position(now) - self._travel
+        target = 1e3 * self.carriage.position(now) + self._shift
         for row in range(len(self._travel)):
             if "XYZ"[row] in values:
                 target[row] = values["XYZ"[row]] * self._unit
@@ -199,7 +198,7 @@ class GrblDevice:
         if np.any(target > 0) or np.any(target < -self._travel):
             self._halt(2)
             return ""
-        self.carriage.move((target + self._travel) / 1e3, self._feed / 60e3, now)
+        self.carriage.move((target - self._shift) / 1e3, self._feed / 60e3, now)
         return "ok\r\n"
 
 

@@ -140,7 +140,7 @@ def test_refuses_targets_before_they_leave() -> None:
     ("kind", "words"),
     [
         ("stall", r"stuck: no nearer for 1 s at x 0\.[0-3]\d* m"),
-        ("alarm", r"hard limit: a switch was hit, the position is lost \(ALARM:1\)"),
+        ("alarm", r"hard limit: a switch was hit, the position is lost \(ALARM:1\), at x 0\.2"),
         ("silent", "no status report within 2 s"),
         ("drop", "the connection was lost"),
     ],
