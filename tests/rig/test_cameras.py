@@ -21,6 +21,7 @@ from rig.cameras.folder import FolderCamera, FolderOptions
 from rig.cameras.zed import camera_from, depth_from, rgb_from, stamp_from
 from rig.errors import CameraError
 from tests.rig.arm_scene import write_arm
+from tests.rig.peers import ROOT
 
 BUILT_IN = {"folder", "genicam", "realsense", "zed"}
 
@@ -120,7 +121,7 @@ def test_no_camera_is_imported_before_it_is_used() -> None:
         " 'cv2'} & set(sys.modules)))"
     )
     printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert printed.stdout.strip() == "[]"
 
