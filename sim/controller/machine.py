@@ -20,12 +20,14 @@ from sim.controller.robot import (
     RobotMode,
     Runtime,
     ScriptError,
-    pose_vector,
 )
 from sim.controller.surroundings import Surroundings
 from sim.seeds import stream
 
 _SLOW = 0.1
+_OUT_INT, _OUT_DOUBLE = (
+    tuple(f"output_{kind}_register_{k}" for k in range(48)) for kind in ("int", "double")
+)
 _JOINT_RUNNING = 253
 _POWERED, _PROGRAM = 1 << 0, 1 << 1
 """Of RTDE's robot_status_bits."""
@@ -99,7 +101,7 @@ class Machine:
         """RTDE's variables; what is left out is 0."""
         robot, registers = self.robot, self.registers
         q, qd = robot.encoders.tolist(), robot.velocities.tolist()
-        pose = pose_vector(robot.T_base_tcp).tolist()
+        pose = robot.tcp
         powered = robot.robot_mode == RobotMode.RUNNING
         playing = robot.runtime == Runtime.PLAYING
         values: dict[str, Value] = {
@@ -119,10 +121,8 @@ class Machine:
             "speed_scaling": robot.slider,
             "target_speed_fraction": robot.slider,
         }
-        for k, number in enumerate(registers.out_int):
-            values[f"output_int_register_{k}"] = number
-        for k, number in enumerate(registers.out_double):
-            values[f"output_double_register_{k}"] = number
+        values.update(zip(_OUT_INT, registers.out_int, strict=True))
+        values.update(zip(_OUT_DOUBLE, registers.out_double, strict=True))
         return values
 
     # What the control channel asks for
