@@ -1,4 +1,4 @@
-"""The joints of an arm along a straight line of its flange, compiled: quick enough for a control loop.
+"""The joints of an arm along a straight line of its flange, quick enough for a control loop.
 
 The place moves evenly from start to goal while the orientation turns evenly about one axis. Each
 point of the line is solved from the one before by damped Newton steps, so that the arm never jumps
@@ -75,27 +75,30 @@ def straight(arm: DhArm, q0: ArrayLike, T_base_flange: ArrayLike) -> Line:
 @nb.njit(cache=True, nogil=True)
 def flange(links: Array, q: Array) -> Array:
     """``T_base_flange`` (4, 4) at joints (n,); `links` (n, 4, 4) are `DhArm.links`."""
-    return _frames(links, q)[-1]
+    frames = np.empty((len(q) + 1, 4, 4))
+    _frames(links, q, frames)
+    T: Array = frames[-1]
+    return T
 
 
 @nb.njit(cache=True, nogil=True)
-def _frames(links: Array, q: Array) -> Array:
-    """Frames (n + 1, 4, 4), the base first."""
-    n = len(q)
-    T = np.zeros((n + 1, 4, 4))
+def _frames(links: Array, q: Array, T: Array) -> None:
+    """Fill the frames T (n + 1, 4, 4), the base first."""
     for i in range(4):
-        T[0, i, i] = 1.0
-    for k in range(n):
+        for j in range(4):
+            T[0, i, j] = 1.0 if i == j else 0.0
+    for k in range(len(q)):
         c, s = np.cos(q[k]), np.sin(q[k])
         for i in range(3):
-            # The columns of T Rz(q).
+            # A row of T Rz(q).
             x = c * T[k, i, 0] + s * T[k, i, 1]
             y = c * T[k, i, 1] - s * T[k, i, 0]
+            z = T[k, i, 2]
             for j in range(4):
-                T[k + 1, i, j] = x * links[k, 0, j] + y * links[k, 1, j] + T[k, i, 2] * links[k, 2, j]
+                T[k + 1, i, j] = x * links[k, 0, j] + y * links[k, 1, j] + z * links[k, 2, j]
             T[k + 1, i, 3] += T[k, i, 3]
-        T[k + 1, 3, 3] = 1.0
-    return T
+        for j in range(4):
+            T[k + 1, 3, j] = T[0, 3, j]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -103,15 +106,16 @@ def _follow(
     links: Array, lower: Array, upper: Array, T_line: Array, joints: Array
 ) -> tuple[int, int]:
     """Fill `joints` (k, n) from its first row on; the last row that is right, and why it ends."""
+    n = joints.shape[1]
     for k in range(1, len(T_line)):
-        q = joints[k - 1].copy()
-        if not _solve(links, T_line[k], q):
+        joints[k] = joints[k - 1]
+        if not _solve(links, T_line[k], joints[k]):
             return k - 1, _NO_SOLUTION
-        if np.any(q < lower) or np.any(q > upper):
-            return k - 1, _LIMIT
-        if np.max(np.abs(q - joints[k - 1])) > JUMP:
-            return k - 1, _JUMPED
-        joints[k] = q
+        for i in range(n):
+            if not lower[i] <= joints[k, i] <= upper[i]:
+                return k - 1, _LIMIT
+            if abs(joints[k, i] - joints[k - 1, i]) > JUMP:
+                return k - 1, _JUMPED
     return len(T_line) - 1, _DONE
 
 
@@ -119,25 +123,79 @@ def _follow(
 def _solve(links: Array, T_goal: Array, q: Array) -> bool:
     """Bring `q` (n,) to the goal; whether it came there."""
     n = len(q)
-    J, e = np.empty((6, n)), np.empty(6)
+    T, J, e = np.empty((n + 1, 4, 4)), np.empty((6, n)), np.empty(6)
+    square = np.empty((6, 6))
     for _ in range(_STEPS):
-        T = _frames(links, q)
-        # Twice the sine of the angle left, times its axis: as good as the angle once it is small.
-        e[3:] = 0.0
-        for j in range(3):
-            e[j] = T_goal[j, 3] - T[n, j, 3]
-            e[3:] += 0.5 * np.cross(T[n, :3, j], T_goal[:3, j])
-        if np.max(np.abs(e)) < _TOLERANCE:
+        _frames(links, q, T)
+        worst = _error(T_goal, T[n], e)
+        if worst < _TOLERANCE:
             return True
-        for i in range(n):
-            axis = T[i, :3, 2].copy()
-            J[:3, i] = np.cross(axis, T[n, :3, 3] - T[i, :3, 3])
-            J[3:, i] = axis
-        square = J @ J.T
-        damping = min(0.1 * np.sum(e * e), 0.1) + 1e-18
+        for k in range(n):
+            _axis(T[k], T[n], J, k)
+        # Damped least norm: J^T (J J^T + lambda I)^-1 e.
+        damping = 1e-18
         for i in range(6):
-            square[i, i] += damping
-        step = J.T @ np.linalg.solve(square, e)
-        longest = np.max(np.abs(step))
-        q += step * min(1.0, 0.5 / max(longest, 1e-300))
+            damping += min(0.1 * e[i] * e[i], 0.02)
+        for i in range(6):
+            for j in range(6):
+                square[i, j] = damping if i == j else 0.0
+                for k in range(n):
+                    square[i, j] += J[i, k] * J[j, k]
+        _solve_symmetric(square, e)
+        longest = 0.5
+        for k in range(n):
+            J[0, k] *= e[0]
+            for i in range(1, 6):
+                J[0, k] += J[i, k] * e[i]
+            longest = max(longest, abs(J[0, k]))
+        for k in range(n):
+            q[k] += J[0, k] * 0.5 / longest
     return False
+
+
+@nb.njit(cache=True, nogil=True)
+def _error(T_goal: Array, T: Array, e: Array) -> float:
+    """Fill e (6,), m and rad; its largest component."""
+    for i in range(3):
+        e[i], e[i + 3] = T_goal[i, 3] - T[i, 3], 0.0
+    # The sine of the angle left, times its axis: as good as the angle once it is small.
+    for j in range(3):
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            e[i + 3] += 0.5 * (T[a, j] * T_goal[b, j] - T[b, j] * T_goal[a, j])
+    worst = 0.0
+    for i in range(6):
+        worst = max(worst, abs(e[i]))
+    return worst
+
+
+@nb.njit(cache=True, nogil=True)
+def _axis(T_joint: Array, T_flange: Array, J: Array, k: int) -> None:
+    """Fill column k of the Jacobian (6, n): ``[z x (p_flange - p), z]``."""
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        arm_a, arm_b = T_flange[a, 3] - T_joint[a, 3], T_flange[b, 3] - T_joint[b, 3]
+        J[i, k] = T_joint[a, 2] * arm_b - T_joint[b, 2] * arm_a
+        J[i + 3, k] = T_joint[i, 2]
+
+
+@nb.njit(cache=True, nogil=True)
+def _solve_symmetric(A: Array, x: Array) -> None:
+    """Solve ``A x = b`` in place, x (m,) is b before; A (m, m), positive definite, is spent."""
+    m = len(x)
+    for j in range(m):
+        for k in range(j):
+            A[j, j] -= A[j, k] * A[j, k]
+        A[j, j] = np.sqrt(A[j, j])
+        for i in range(j + 1, m):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] /= A[j, j]
+    for i in range(m):
+        for k in range(i):
+            x[i] -= A[i, k] * x[k]
+        x[i] /= A[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            x[i] -= A[k, i] * x[k]
+        x[i] /= A[i, i]

@@ -34,6 +34,9 @@ class Channel:
                 self._incoming = b""
             self._peer.settimeout(max(deadline - time.monotonic(), 1e-3))
             self._peer.sendall(json.dumps({"do": do, **arguments}).encode() + b"\n")
+            if do == "kill":
+                self.close()
+                return {}
             answer = json.loads(self._line(deadline))
         except TimeoutError:
             self.close()

@@ -1,4 +1,4 @@
-"""One client of one port: what it has sent that is not a whole message yet, and what it waits for."""
+"""One client of one port: what it asked that is not answered yet, and how it is answered."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class Control(_Lines):
         """See `Connection`."""
         super().__init__(peer, machine)
         self.asked = []
-        """What concerns the sockets, for the server to do."""
+        """What concerns the sockets, for the server to do and to answer."""
 
     def _answer(self, line: str) -> str | None:
         try:
@@ -188,7 +188,7 @@ class Control(_Lines):
                 raise ValueError(f"{line!r}: expected a JSON object")
             if request.get("do") in ("drop", "refuse", "kill"):
                 self.asked.append(request)
-                return json.dumps({"ok": True})
+                return None
             if request.get("do") == "expose" and "blind" in self.machine.faults:
                 return None
             return json.dumps({"ok": True, **self.machine.obey(request)})

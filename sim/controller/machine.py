@@ -95,7 +95,9 @@ class Machine:
         """The input registers that another client holds: the lower ones, if any."""
         if "registers-taken" not in self.faults:
             return frozenset()
-        return frozenset(f"input_{kind}_register_{k}" for kind in ("int", "double") for k in range(24))
+        return frozenset(
+            f"input_{kind}_register_{k}" for kind in ("int", "double") for k in range(24)
+        )
 
     def variables(self) -> dict[str, Value]:
         """RTDE's variables; what is left out is 0."""

@@ -27,7 +27,7 @@ class Path(Protocol):
 
     @property
     def length(self) -> float:
-        """m or rad."""
+        """Of the whole path, m or rad."""
 
     @property
     def fastest(self) -> float:

@@ -72,7 +72,9 @@ def messages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
     while len(buffer) >= HEADER.size:
         size, kind = HEADER.unpack_from(buffer)
         if size < HEADER.size:
-            raise SimulationError(f"RTDE: a message of {size} bytes, expected {HEADER.size} or more")
+            raise SimulationError(
+                f"RTDE: a message of {size} bytes, expected {HEADER.size} or more"
+            )
         if len(buffer) < size:
             return
         content = bytes(buffer[HEADER.size : size])

@@ -173,6 +173,7 @@ class Server:
         elif isinstance(client, Control):
             while client.asked:
                 self._obey(client.asked.pop(0))
+                client.send(b'{"ok": true}\n')
 
     def _obey(self, request: dict[str, object]) -> None:
         if request["do"] == "kill":
