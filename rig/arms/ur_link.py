@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from rig.errors import ArmError
 
-_PARTING = 1.5
+_PARTING = 1.2
 """For a child to brake the arm, end the script and hang up, s."""
 
 
