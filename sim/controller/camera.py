@@ -33,6 +33,7 @@ from sim.world import World
 Array = NDArray[np.float64]
 
 _SMALL = (64, 48)
+_FROM_ABOVE = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.5, 1.0])
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ class SimulatedCamera:
         self._studio, self._last = _Studio(world, sensor, stages, joints), None
         # What is compiled or built for a first frame must not take that frame's time.
         small = replace(self._studio, sensor=sensor.resized(*_SMALL))
-        small.expose(np.zeros(len(joints)), np.diag([1.0, -1.0, -1.0, 1.0]), 0, 0, self._rgb)
+        small.expose(np.zeros(len(joints)), _FROM_ABOVE, 0, 0, self._rgb)
         noise = stated_noise(sensor, stages)
         return SimulatedInfo(
             model=sensor.model,

@@ -103,7 +103,7 @@ class Rtde(Connection):
                 self._inputs[number] = recipe
             self.send(message(kind, bytes([number]) + recipe.described()))
         elif kind in (protocol.START, protocol.PAUSE):
-            self.streaming = kind == protocol.START
+            self.streaming, self._due = kind == protocol.START, 0.0
             self.send(message(kind, b"\x01"))
         elif kind == DATA and content and content[0] in self._inputs:
             self.machine.take_inputs(self._inputs[content[0]].unpack(content[1:]))
@@ -114,6 +114,7 @@ class Rtde(Connection):
         """Whether a package is due; it is taken to be sent then."""
         if not self.streaming or now < self._due:
             return False
+        self._due = self._due or now
         self.send(b"")
         if self.lazy:
             return False

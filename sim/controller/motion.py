@@ -122,8 +122,10 @@ class Motion:
         a, t = self.acceleration, self.time
         if self._braking is not None:
             since, s, v = self._braking
-            t = min(t - since, v / a)
-            return s + v * t - 0.5 * a * t * t, v - a * t, v - a * t <= 0.0
+            t -= since
+            if t >= v / a:
+                return s + 0.5 * v * v / a, 0.0, True
+            return s + v * t - 0.5 * a * t * t, v - a * t, False
         left = self._end - t
         if left <= 0.0:
             return self.path.length, 0.0, True

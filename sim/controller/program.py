@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from sim.controller.robot import Robot, ScriptError, pose_matrix, pose_vector
+from sim.controller.robot import Robot, Runtime, ScriptError, pose_matrix, pose_vector
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class Program:
         """A move that goes on while other commands are taken."""
         self._operation = 0
         if self._controlled:
-            self._answer(0)
+            self._set_int(0, 0)
             self._set_int(2, 0)
         else:
             self._waiting = self._along(self._moves)
@@ -135,7 +135,9 @@ class Program:
         self._registers.out_int[self._int + index] = value
 
     def _answer(self, value: int) -> None:
-        self._set_int(0, value)
+        # A program that a stop has paused says nothing.
+        if self._robot.runtime == Runtime.PLAYING:
+            self._set_int(0, value)
 
     def _give(self, values: Array) -> None:
         at = self._double
