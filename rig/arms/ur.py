@@ -248,7 +248,10 @@ class UrArm:
                 return straight(self._dh, q, T).joints[-1]
             except OutOfReach as error:
                 place = np.round(T[:3, 3], 3).tolist()
-                raise ArmError(f"{self.options.host}: target at {place} m: {error}") from None
+                raise ArmError(
+                    f"{self.options.host}: target at {place} m: {error}; expected a pose that the"
+                    " arm reaches in a straight line"
+                ) from None
 
         return self._go("move_line", end_of_line, speed, acceleration)
 
@@ -315,7 +318,7 @@ class UrArm:
                 f"{self.options.host}: robot mode {found['mode']}, expected {_RUNNING} (running):"
                 " power the robot on"
             )
-        if found["runtime"] != _PLAYING:
+        if found["runtime"] != _PLAYING or not found["obeying"]:
             if not self._remote():
                 raise ArmError(
                     f"{self.options.host}: the robot is in local mode, expected remote control"
@@ -325,7 +328,7 @@ class UrArm:
             except Refused as error:
                 raise ArmError(_explained(str(error))) from None
             end = time.monotonic() + 3.0
-            while (found := self._instant())["runtime"] != _PLAYING:
+            while not ((found := self._instant())["obeying"] and found["runtime"] == _PLAYING):
                 self._refuse_stop(found)
                 if time.monotonic() > end:
                     raise ArmError(
