@@ -9,6 +9,7 @@ kinematics, never from the controller.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import threading
 import time
 from collections.abc import Callable
@@ -140,6 +141,10 @@ class UrArm:
         """See `Arm`."""
         self._drop()
         options = self.options
+        if importlib.util.find_spec("rtde_control") is None:
+            raise ArmError(
+                "ur-rtde is not installed, expected it beside us: pip install 'depthba[rig]'"
+            )
         self.greeting = preflight(options.host, options.patience)
         self._link = Link(options.host)
         try:
@@ -406,4 +411,4 @@ def _explained(said: str) -> str:
         )
     if "remote control" in lower:
         return f"{said}; expected remote control, which the teach pendant switches to"
-    return said
+    return f"{said}; expected the control script to run"
