@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from depthba import se3
 from depthba.errors import OptionError, OutOfReach
 from depthba.kinematics import UR16E, DhArm
 from depthba.straight import straight
 from depthba.ur_calibration import read_calibration
 from rig.arms.arm import ArmState, Safety
+from rig.arms.targets import check_rate, checked_joints, checked_pose
 from rig.arms.ur_link import Link, Lost, Refused
 from rig.arms.ur_preflight import Greeting, ask_dashboard, preflight, refuse_stop
 from rig.errors import ArmError, EmergencyStop, ProtectiveStop, Stopped
@@ -233,20 +233,18 @@ class UrArm:
 
     def move_joints(self, target: ArrayLike, *, speed: float, acceleration: float) -> ArmState:
         """See `Arm`."""
-        joints = self._checked_joints(target)
-        self._check_rate("speed", speed, self.options.joint_speed, "rad/s")
-        self._check_rate("acceleration", acceleration, np.inf, "rad/s^2")
+        host = self.options.host
+        joints = checked_joints(target, self._dh, host)
+        check_rate("speed", speed, self.options.joint_speed, "rad/s", host)
+        check_rate("acceleration", acceleration, np.inf, "rad/s^2", host)
         return self._go("move_joints", lambda q: joints, speed, acceleration)
 
     def move_linear(self, target: ArrayLike, *, speed: float, acceleration: float) -> ArmState:
         """See `Arm`. The joints at the end are our own; the controller is sent those."""
-        T = np.asarray(target, float)
-        if T.shape != (4, 4) or not se3.is_rigid(T):
-            raise ArmError(
-                f"{self.options.host}: target {T.tolist()}: expected a rigid, finite pose (4, 4)"
-            )
-        self._check_rate("speed", speed, self.options.tool_speed, "m/s")
-        self._check_rate("acceleration", acceleration, np.inf, "m/s^2")
+        host = self.options.host
+        T = checked_pose(target, host)
+        check_rate("speed", speed, self.options.tool_speed, "m/s", host)
+        check_rate("acceleration", acceleration, np.inf, "m/s^2", host)
 
         def end_of_line(q: Array) -> Array:
             try:
@@ -254,7 +252,7 @@ class UrArm:
             except OutOfReach as error:
                 place = np.round(T[:3, 3], 3).tolist()
                 raise ArmError(
-                    f"{self.options.host}: target at {place} m: {error}; expected a pose that the"
+                    f"{host}: target at {place} m: {error}; expected a pose that the"
                     " arm reaches in a straight line"
                 ) from None
 
@@ -266,30 +264,6 @@ class UrArm:
         # A link that is lost has been ended, and the arm braked by it as well as it could be.
         with contextlib.suppress(ArmError):
             self._ask("stop", 2.0)
-
-    def _checked_joints(self, target: ArrayLike) -> Array:
-        host, dh = self.options.host, self._dh
-        try:
-            q = np.array(target, float)
-        except (TypeError, ValueError):
-            raise ArmError(f"{host}: target {target!r}: expected joints in rad") from None
-        if q.shape != (len(dh.joints),):
-            raise ArmError(
-                f"{host}: target {q.tolist()}: {q.size} numbers, expected {len(dh.joints)} joints"
-            )
-        if not np.isfinite(q).all():
-            raise ArmError(f"{host}: target {q.tolist()}: expected finite joints, rad")
-        for name, value, low, high in zip(dh.joints, q, dh.lower, dh.upper, strict=True):
-            if not low <= value <= high:
-                raise ArmError(
-                    f"{host}: target {name} {value:.4f} rad: expected {low:.4f} to {high:.4f}"
-                )
-        return q
-
-    def _check_rate(self, name: str, value: float, most: float, unit: str) -> None:
-        if not (np.isfinite(value) and 0.0 < value <= most):
-            limit = f"above 0 and at most {most:g}" if np.isfinite(most) else "above 0"
-            raise ArmError(f"{self.options.host}: {name} {value}: expected {limit} {unit}")
 
     def _go(
         self, do: str, end_of: Callable[[Array], Array], speed: float, acceleration: float
