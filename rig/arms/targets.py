@@ -1,4 +1,4 @@
-"""What is checked of a target before it leaves for a robot. ArmError names what is wrong with it."""
+"""What is checked of a target before it leaves for a robot; ArmError names what is wrong."""
 
 from __future__ import annotations
 
