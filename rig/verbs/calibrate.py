@@ -12,14 +12,14 @@ from depthba.errors import DatasetError, OptionError
 from depthba.verbs import DONE, NOT_TO_BE_TRUSTED
 from depthba.verbs.output import angle, length, note, print_json
 from depthba.verbs.progress import Bar
-from rig.hand_eye.from_depth import Options
+from rig.hand_eye.depth.calibration import Options
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from depthba.dataset import Dataset
-    from rig.hand_eye.descent import Iteration
+    from rig.hand_eye.depth.descent import Iteration
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ def run(arguments: Arguments) -> int:
     from depthba.dataset import Dataset
     from depthba.run_folder import RunFolder, default_path, link_latest
     from depthba.verbs.register import removed_on_failure
-    from rig.hand_eye.from_depth import calibrate
-    from rig.hand_eye.report import FILE, content, text
+    from rig.hand_eye.depth.calibration import calibrate
+    from rig.hand_eye.depth.report import FILE, content, text
 
     if not arguments.from_depth:
         raise OptionError(
@@ -79,7 +79,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _start(dataset: Dataset, path: Path | None) -> NDArray[np.float64]:
-    from rig.hand_eye.report import read_transform
+    from rig.hand_eye.depth.report import read_transform
 
     if path is not None:
         return read_transform(path)

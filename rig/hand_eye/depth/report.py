@@ -13,7 +13,7 @@ from depthba import se3
 from depthba.dataset import Dataset
 from depthba.errors import OptionError
 from depthba.verbs.output import length
-from rig.hand_eye.from_depth import HandEye
+from rig.hand_eye.depth.calibration import HandEye
 
 FILE = "hand_eye.json"
 
