@@ -19,11 +19,11 @@ ALIKE = 0.02
 STILL = 0.01
 
 
-def flange_poses(dataset: Dataset) -> Array:
+def flange_poses(dataset: Dataset, least: int = 3) -> Array:
     """Return (N, 4, 4) T_base_flange.
 
     Raises:
-        DatasetError: a frame has none.
+        DatasetError: a frame has none, or there are fewer than `least`.
     """
     poses = []
     for frame in dataset:
@@ -33,9 +33,9 @@ def flange_poses(dataset: Dataset) -> Array:
                 "hand-eye calibration needs the robot's flange pose of every frame"
             )
         poses.append(frame.T_base_flange)
-    if len(poses) < 3:
+    if len(poses) < least:
         raise DatasetError(
-            f"{dataset.path}: {len(poses)} frames, but hand-eye calibration needs at least 3"
+            f"{dataset.path}: {len(poses)} frames, but hand-eye calibration needs at least {least}"
         )
     return np.stack(poses)
 

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from depthba import se3
 from depthba.errors import OptionError
 from rig.hand_eye.board.begin import Beginning
-from rig.hand_eye.board.chain import LENS, Chain, errors
+from rig.hand_eye.board.chain import Chain, errors
 from rig.hand_eye.board.noise import Noise, Prior
 from rig.hand_eye.board.observations import Observations
 from rig.hand_eye.board.refine import Problem, Solution, minimise
@@ -27,7 +27,7 @@ ROUNDS = 30
 # The noises have settled when they change by less than this share.
 SETTLED = 0.005
 # What is stated of the robot counts as much as this many poses.
-STATED = 3.0
+STATED = 1.0
 # Degrees of freedom of the heavy tails, and where corners lose weight, in standard deviations.
 TAILS = 5.0
 CORNER = 4.0
@@ -80,7 +80,6 @@ def estimate(
     P: Array,
     prior: Prior,
     stated: Stated,
-    velocity: Array | None = None,
 ) -> Estimate:
     """Estimate X and everything beside it.
 
@@ -90,10 +89,9 @@ def estimate(
         P: (N, 4, 4), T_camera_board of each picture alone.
         prior: of lens, size, clock and zeros.
         stated: of the noises.
-        velocity: (N, 6), of the flanges; None: they stood.
     """
     n = len(observations)
-    velocity = np.zeros((n, 6)) if velocity is None else velocity
+    velocity = observations.speed
     joints = observations.joints
     count = 0 if joints is None or prior.zero == 0 else joints.shape[-1]
     if count == 0:
@@ -112,7 +110,7 @@ def estimate(
     kept &= (kept.sum(axis=1) >= 0.5 * seen.sum(axis=1))[:, None]  # else the picture is spoilt
     if not kept.any():
         raise OptionError("no corner fits any pose, expected corners of one board")
-    dropped = _too_far(solution, kept)
+    dropped = _too_far(solution)
     for _ in range(3):
         problem = replace(
             solution.problem, corner_weights=kept.astype(float), pose_weights=1.0 - dropped
@@ -227,13 +225,7 @@ def _noises(solution: Solution, stated: Stated) -> Noise:
     )
 
 
-def _too_far(solution: Solution, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _too_far(solution: Solution) -> NDArray[np.bool_]:
     """(N,), poses that the heavy tails have all but given up, at most half of all."""
     far = distances(solution) > chi2.isf(UNLIKELY, 6) * 1.5
-    del kept
     return far if far.sum() <= len(far) // 2 else np.zeros(len(far), bool)
-
-
-def lens_sigma(prior: Prior) -> Array:
-    """(9,), what is believed of the lens."""
-    return prior.sigma(LENS.stop)[LENS]

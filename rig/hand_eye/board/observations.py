@@ -45,6 +45,8 @@ class Observations:
     joints: Array | None = None
     """(N, 6, n), how the flanges move with the joints' zeros, m and rad per rad; None where the arm
     is not known."""
+    velocity: Array | None = None
+    """(N, 6), m/s and rad/s, base axes, of the flanges at the stamps; None: they stood."""
 
     def __post_init__(self) -> None:
         """OptionError where the shapes do not belong together."""
@@ -62,6 +64,11 @@ class Observations:
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.T_base_flange)
+
+    @property
+    def speed(self) -> Array:
+        """(N, 6), the velocity, 0 where it is not known."""
+        return np.zeros((len(self), 6)) if self.velocity is None else self.velocity
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -90,4 +97,5 @@ class Observations:
             stamps=None if self.stamps is None else self.stamps[index],
             stamps_robot=None if self.stamps_robot is None else self.stamps_robot[index],
             joints=None if self.joints is None else self.joints[index],
+            velocity=None if self.velocity is None else self.velocity[index],
         )

@@ -7,7 +7,7 @@ costs a matrix of what all poses share, and one of 6 x 6 a pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +84,10 @@ class Normal:
         solved = np.linalg.solve(
             D, np.concatenate([np.swapaxes(self.C, -1, -2), self.h[..., None]], axis=-1)
         )
-        S = self.H + damping * np.diag(np.diag(self.H)) - np.einsum(
-            "nsk,nkt->st", self.C, solved[..., :-1]
+        S = (
+            self.H
+            + damping * np.diag(np.diag(self.H))
+            - np.einsum("nsk,nkt->st", self.C, solved[..., :-1])
         )
         g = self.g - np.einsum("nsk,nk->s", self.C, solved[..., -1])
         return (S + S.T) / 2, g, solved
@@ -201,8 +203,3 @@ def _solve(S: Array, g: Array) -> Array:
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     matrix = scale[:, None] * S * scale + 1e-12 * np.eye(len(S))
     return np.asarray(scale * np.linalg.solve(matrix, scale * g))
-
-
-def reweighed(problem: Problem, **changes: object) -> Problem:
-    """Return the problem with some of its parts replaced."""
-    return replace(problem, **changes)  # type: ignore[arg-type]
