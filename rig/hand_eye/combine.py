@@ -88,7 +88,7 @@ def combine(one: HandEyeRecord, other: HandEyeRecord) -> Combined:
         T = se3.retract(T, step)
         if np.abs(step).max() < 1e-12:
             break
-    return Combined(T, np.linalg.inv(I_a + I_b), distance)
+    return Combined(T, np.asarray(np.linalg.inv(I_a + I_b), np.float64), distance)
 
 
 def combined_record(own: HandEyeRecord, other: HandEyeRecord, combined: Combined) -> HandEyeRecord:

@@ -44,6 +44,14 @@ class Setup:
     mount: Mount = "eye-in-hand"
 
 
+COLUMNS = {
+    "exact": Setup(),
+    "K off": Setup(camera_off=(0.001, 1.5)),
+    "robot x 10": Setup(robot_t=0.0005, robot_r=0.1 * DEGREE),
+}
+"""What is studied: focal length off by 0.1 % and centre by 1.5 px; a robot ten times worse."""
+
+
 def views(setup: Setup, rng: np.random.Generator) -> Floats:
     """(N, 4, 4) T_camera_board."""
     n = setup.count

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from rig.hand_eye.board import park_martin
+from rig.hand_eye.flanges import STILL
 
 Array = NDArray[np.float64]
 
@@ -17,6 +18,8 @@ ROUNDS = 10
 APART = 6.0
 # Nothing closes better than this, m and rad.
 LEAST_T, LEAST_R = 1e-5, 1e-5
+# Rotations tried about the one axis of all turns.
+TRIES = 90
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,31 @@ class Beginning:
         return float(np.median(size[:, 0])), float(np.median(size[:, 1]))
 
 
+def closed_form(m: park_martin.Motions) -> Array:
+    """Return X (4, 4), also where the turns leave its rotation open and shifts fix it.
+
+    Without turns ``t_A = R_X t_B``. With turns about one axis alone, the rotation about that axis
+    is tried all round, and the one kept with which the translations close best.
+    """
+    values, axes = np.linalg.eigh(m.alpha.T @ m.alpha / max(len(m.alpha), 1))
+    size = np.sqrt(np.maximum(values[::-1], 0.0))
+    if size[0] < STILL:
+        R = park_martin.solve_rotation(m.A[:, :3, 3], m.B[:, :3, 3])
+        return se3.make(R, np.zeros(3))
+    if size[1] >= STILL:
+        return park_martin.solve(m)
+    first = park_martin.solve_rotation(m.alpha, m.beta)
+    best, found = np.inf, se3.make(first, np.zeros(3))
+    for turn in np.linspace(0, 2 * np.pi, TRIES, endpoint=False):
+        R = se3.exp_so3(turn * axes[:, 2]) @ first
+        t, _ = park_martin.solve_translation(m.A, m.B, R)
+        misfit = (m.A[:, :3, :3] - np.eye(3)) @ t - m.B[:, :3, 3] @ R.T + m.A[:, :3, 3]
+        square = float(np.square(misfit).sum())
+        if square < best:
+            best, found = square, se3.make(R, t)
+    return found
+
+
 def sizes(delta: Array) -> Array:
     """(N, 2), m and rad, of perturbations (N, 6)."""
     return np.stack(
@@ -55,13 +83,13 @@ def begin(G: Array, P: Array) -> Beginning:
     """
     good = agreeing(G, P)
     for _ in range(ROUNDS):
-        X = park_martin.solve(park_martin.motions(G[good], P[good]))
+        X = closed_form(park_martin.motions(G[good], P[good]))
         each = park_martin.board_poses(G, P, X)
         Y = park_martin.mean_pose(each[good])
         closure = se3.difference(each, Y)
         size = sizes(closure)
         typical = np.maximum(np.median(size[good], axis=0), [LEAST_T, LEAST_R])
-        better = (size < APART * typical).all(axis=1)
+        better = np.asarray((size < APART * typical).all(axis=1))
         if better.sum() < max(3, len(G) // 2) or (better == good).all():
             break
         good = better

@@ -43,6 +43,9 @@ FOCAL, ASPECT, CENTRE = 0.001, 0.0002, 0.001
 LENS = (1.0, 0.002, 0.1, 1.0, 1.0, 0.01, 0.01, 1.0)
 # Of a joint's zero, rad.
 ZERO = 0.0005
+# How far a camera may be from the flange or, fixed, from the robot's base, m: what is believed
+# where the motions leave it open.
+REACH, REACH_FIXED = 0.3, 3.0
 # A clock that is off by more than this, s, is no clock.
 CLOCK = 1.0
 
@@ -189,7 +192,7 @@ def calibrate(
     if observations.stamps is not None and observations.stamps_robot is not None:
         notes += _stamp_notes(observations)
     away = np.linalg.norm(P[:, :3, 3], axis=1)
-    verdict = judge(found, square, float(np.median(away)))
+    verdict = judge(found, square, float(np.median(away)), prior.reach)
     gone = [str(observations.ids[i]) for i in np.flatnonzero(found.dropped)]
     if gone:
         notes.append(f"left out, their flange poses do not fit the rest: frames {', '.join(gone)}")
@@ -198,7 +201,7 @@ def calibrate(
         reason=verdict.reason,
         mount=options.mount,
         T=None if verdict.status == "inconsistent" else found.X,
-        covariance=None if verdict.status == "inconsistent" else found.covariance,
+        covariance=None if verdict.status == "inconsistent" else verdict.covariance,
         open=verdict.open,
         turned=size,
         observations=observations,
@@ -218,14 +221,15 @@ def prior_of(options: BoardOptions, observations: Observations) -> Prior:
     """Return what is believed of all that the poses share."""
     camera = observations.camera
     zero = ZERO if options.joint_zeros and observations.joints is not None else 0.0
+    reach = REACH if options.mount == "eye-in-hand" else REACH_FIXED
     if options.intrinsics == "fixed":
-        return Prior(zero=zero)
+        return Prior(reach, zero=zero)
     if options.intrinsics == "estimated":
         focal, aspect, centre, *distortion = LENS
         c = centre * camera.width
-        return Prior((focal, aspect, c, c, *distortion), zero=zero)
+        return Prior(reach, (focal, aspect, c, c, *distortion), zero=zero)
     c = CENTRE * camera.width
-    return Prior((FOCAL, ASPECT, c, c, 0.0, 0.0, 0.0, 0.0, 0.0), zero=zero)
+    return Prior(reach, (FOCAL, ASPECT, c, c, 0.0, 0.0, 0.0, 0.0, 0.0), zero=zero)
 
 
 def stated_of(options: BoardOptions) -> Stated:

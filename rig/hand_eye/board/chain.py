@@ -63,8 +63,12 @@ class Chain:
         )
 
     def values(self) -> Array:
-        """(s,), what is shared as departures from what is believed; 0 for X and Y."""
-        return np.concatenate([np.zeros(12), self.lens, [self.size, self.clock], self.zeros])
+        """(s,), what is shared as departures from what is believed; X is believed near its frame.
+
+        0 for X's rotation and for Y, of which nothing is believed.
+        """
+        place = np.concatenate([self.X[:3, 3], np.zeros(9)])
+        return np.concatenate([place, self.lens, [self.size, self.clock], self.zeros])
 
     def camera(self, observations: Observations) -> Camera:
         """Return the camera as it is thought to be."""

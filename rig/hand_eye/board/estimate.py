@@ -113,7 +113,9 @@ def estimate(
     dropped = _too_far(solution)
     for _ in range(3):
         problem = replace(
-            solution.problem, corner_weights=kept.astype(float), pose_weights=1.0 - dropped
+            solution.problem,
+            corner_weights=kept.astype(float),
+            pose_weights=np.where(dropped, 0.0, 1.0),
         )
         solution = _settle(problem, solution.chain, stated, heavy=False)
         distance = distances(solution)

@@ -35,6 +35,9 @@ class Prior:
     Standard deviations; 0 holds a number where it is, infinity leaves it free.
     """
 
+    reach: float = np.inf
+    """How far X's camera may be from X's frame, along each axis, m: it matters where the motions
+    leave that open."""
     lens: tuple[float, ...] = (0.0,) * 9
     """As `lens.NAMES` has them."""
     size: float = 0.0
@@ -45,8 +48,9 @@ class Prior:
     """Of a joint's zero, rad."""
 
     def sigma(self, shared: int) -> Array:
-        """(s,), of all that is shared; X and Y are free."""
+        """(s,), of all that is shared; X's rotation and Y are free."""
         sigma = np.full(shared, np.inf)
+        sigma[:3] = self.reach
         sigma[LENS] = self.lens
         sigma[SIZE], sigma[CLOCK] = self.size, self.clock
         sigma[ZEROS:] = self.zero

@@ -23,14 +23,19 @@ def solve(G: Array, P: Array, method: str) -> Array:
     import cv2  # slow to import, so only where it is used
 
     T = se3.inverse(G)
+    log = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_SILENT)  # it would complain on stderr, beside what we say
     try:
         R, t = cv2.calibrateHandEye(
-            T[:, :3, :3],
-            T[:, :3, 3],
-            P[:, :3, :3],
-            P[:, :3, 3],
+            list(T[:, :3, :3]),
+            list(T[:, :3, 3]),
+            list(P[:, :3, :3]),
+            list(P[:, :3, 3]),
             method=getattr(cv2, f"CALIB_HAND_EYE_{method}"),
         )
     except cv2.error:
         return np.full((4, 4), np.nan)
+    finally:
+        log.setLogLevel(level)
     return se3.make(R, np.ravel(t))

@@ -131,7 +131,7 @@ def _pose_bars(ax: Axes, result: BoardHandEye) -> None:
     colours = [BAD if gone else GOOD for gone in found.dropped]
     ax.bar(x, np.minimum(misfit, top), color=colours)
     for k in np.flatnonzero(found.dropped):
-        ax.text(k, top * 1.01, f"{misfit[k]:.0f}", ha="center", color=BAD, fontsize=8)
+        ax.text(float(k), top * 1.01, f"{misfit[k]:.0f}", ha="center", color=BAD, fontsize=8)
     ax.axhline(limit, color=QUIET, linewidth=1)
     ax.text(len(x) - 0.45, limit, "expected", va="bottom", ha="right", color=QUIET, fontsize=8)
     ax.set_ylim(0, top * 1.08)
@@ -218,7 +218,8 @@ def _draw_methods(ax: Axes, result: BoardHandEye) -> None:
     other = ax.twiny()
     other.barh(y - 0.2, values[:, 1], 0.36, color=NEXT, label="degrees away")
     other.set_xlabel("degrees", color=NEXT)
-    own_t, own_r = 1e3 * np.linalg.norm(sigma[:3]), np.degrees(np.linalg.norm(sigma[3:]))
+    own_t = float(1e3 * np.linalg.norm(sigma[:3]))
+    own_r = float(np.degrees(np.linalg.norm(sigma[3:])))
     ax.axvline(own_t, color=GOOD, linestyle="--", linewidth=1.2)
     other.axvline(own_r, color=NEXT, linestyle="--", linewidth=1.2)
     ax.set_xlim(0, 1.15 * max(values[:, 0].max(), own_t))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +85,7 @@ def record(
     return path
 
 
-def _axes(T: Array, length: float) -> object:
+def _axes(T: Array, length: float) -> Any:
     import rerun as rr
 
     return rr.Arrows3D(

@@ -117,16 +117,28 @@ class Solution:
         return np.asarray(own + back @ self.covariance @ np.swapaxes(back, -1, -2))
 
 
+def pixel_blocks(
+    chain: Chain, observations: Observations, velocity: Array, weights: Array
+) -> Array:
+    """Return the pixels' information of each pose (N, s + 7, s + 7).
+
+    On what is shared, on the flange (6), and in the last row the gradient; weights (N, M) are the
+    corners' over their variance.
+    """
+    error, J, J_pose = linearise(chain, observations, velocity)
+    off = ~(weights > 0)
+    error[off], J[off], J_pose[off] = 0.0, 0.0, 0.0
+    both = np.concatenate([J, J_pose, error[..., None]], axis=-1)
+    both = both.reshape(len(error), -1, chain.shared + 7)
+    weighed = np.repeat(weights, 2, axis=1)[..., None] * both
+    return np.asarray(np.swapaxes(both, -1, -2) @ weighed)
+
+
 def normal_equations(problem: Problem, chain: Chain) -> Normal:
     """Set up the normal equations (half the cost's gradient) at a chain."""
-    error, J, J_pose = linearise(chain, problem.observations, problem.velocity)
+    s = chain.shared
     w = problem.corner_weights / problem.noise.corner**2
-    off = ~(w > 0)
-    error[off], J[off], J_pose[off] = 0.0, 0.0, 0.0
-    n, s = len(error), chain.shared
-    both = np.concatenate([J, J_pose, error[..., None]], axis=-1).reshape(n, -1, s + 7)
-    weighed = np.repeat(w, 2, axis=1)[..., None] * both
-    M = np.swapaxes(both, -1, -2) @ weighed
+    M = pixel_blocks(chain, problem.observations, problem.velocity, w)
     sigma = problem.prior.sigma(s)
     bound = np.isfinite(sigma) & (sigma > 0)
     information = np.zeros(s)

@@ -77,18 +77,21 @@ def suspects(observations: Observations, P: Array, beginning: Beginning) -> list
         beginning: how they close as given.
     """
     G = observations.carrier
-    found = []
+    found, in_hand = [], observations.mount == "eye-in-hand"
     off_t, off_r = beginning.typical
     if off_r > HOPELESS_R:
         robot, camera = (
             np.degrees(turned(T)[0][0]) for T in (observations.T_base_flange, se3.inverse(P))
         )
-        for name, change in CHANGES:
+        closings = []
+        for _, change in CHANGES:
             T = change(observations.T_base_flange)
-            G_changed = se3.inverse(T) if observations.mount == "eye-in-hand" else T
-            if begin(G_changed, P).typical[1] < off_r / BETTER:
-                found.append(name or _fixed_camera(observations.mount))
-                break
+            closings.append(begin(se3.inverse(T) if in_hand else T, P).typical)
+        # rotations decide; of several that close them, positions
+        fitting = [k for k, c in enumerate(closings) if c[1] < off_r / BETTER]
+        if fitting:
+            best = min(fitting, key=lambda k: closings[k][0] + closings[k][1])
+            found.append(CHANGES[best][0] or _fixed_camera(observations.mount))
         else:
             found.append(
                 f"the robot's turns ({robot:.1f} degrees, rms) and the camera's ({camera:.1f}) do "

@@ -13,7 +13,7 @@ from rig.hand_eye.board.chain import CLOCK, SIZE, X
 from rig.hand_eye.board.estimate import Estimate
 from rig.hand_eye.board.refine import Solution, minimise
 from rig.hand_eye.board.views import displacement
-from rig.hand_eye.flanges import motion_fault
+from rig.hand_eye.flanges import motion_fault, turned
 from rig.hand_eye.record import OPEN_R, OPEN_T, Open
 
 Array = NDArray[np.float64]
@@ -31,6 +31,8 @@ HOPELESS_CORNER = 3.0
 # A size or a clock is off when it is this many of its standard deviations away, and worth a word
 # from here on: a share, and s.
 CERTAIN = 5.0
+# Turns about a second axis (root mean square, rad) below which noise passes for knowledge.
+LITTLE = float(np.radians(3.0))
 SIZE_MATTERS, CLOCK_MATTERS = 0.003, 0.001
 
 
@@ -53,6 +55,8 @@ class Verdict:
     status: Status
     reason: str
     open: tuple[Open, ...]
+    covariance: Array
+    """(6, 6), of X; what is open is as uncertain there as before the calibration."""
     size: Tested | None
     """Log of the board's size; None: not to be told from these data."""
     conditioning: float
@@ -92,6 +96,19 @@ def open_directions(covariance: Array) -> tuple[Open, ...]:
     )
 
 
+def honest(covariance: Array, left_open: tuple[Open, ...], reach: float) -> Array:
+    """Return the covariance (6, 6), what is open as uncertain as before.
+
+    Where no motion shows a direction, noise does, and seems to tell something.
+    """
+    whole = covariance.copy()
+    for direction in left_open:
+        size = np.array([*np.full(3, reach), *np.full(3, np.pi)])
+        unit = direction.direction / float(np.linalg.norm(direction.direction / size))
+        whole += np.outer(unit, unit)
+    return whole
+
+
 def conditioning(covariance: Array, distance: float) -> float:
     """Return the largest over the smallest of X's standard deviations, scaled by the distance."""
     scale = np.repeat([1.0, 1.0 / max(distance, 1e-3)], 3)
@@ -99,13 +116,14 @@ def conditioning(covariance: Array, distance: float) -> float:
     return float(np.sqrt(values[-1] / max(values[0], 1e-300)))
 
 
-def judge(found: Estimate, board: float, distance: float) -> Verdict:
+def judge(found: Estimate, board: float, distance: float, reach: float) -> Verdict:
     """Say what the estimate is worth.
 
     Args:
         found: the estimate.
         board: side of the board's squares or what stands for its size, m, for people.
         distance: m, from the cameras to the board.
+        reach: m, how far X's camera may be from X's frame.
     """
     solution, noise = found.solution, found.solution.problem.noise
     covariance = solution.covariance[X, X]
@@ -117,7 +135,7 @@ def judge(found: Estimate, board: float, distance: float) -> Verdict:
     fault = motion_fault(observations.T_base_flange[kept])
 
     def verdict(status: Status, reason: str) -> Verdict:
-        return Verdict(status, reason, left_open, size, how)
+        return Verdict(status, reason, left_open, honest(covariance, left_open, reach), size, how)
 
     if noise.corner > HOPELESS_CORNER:
         return verdict(
@@ -131,14 +149,20 @@ def judge(found: Estimate, board: float, distance: float) -> Verdict:
             "the flange poses do not fit the images: they miss by "
             f"{1e3 * noise.robot_t:.1f} mm and {np.degrees(noise.robot_r):.2f} degrees",
         )
+    little = turned(observations.T_base_flange[kept])[0][1]
+    if not fault and little < LITTLE:
+        fault = (
+            f"the flange turned by only {np.degrees(little):.1f} degrees about its second axis,"
+            f" expected {np.degrees(LITTLE):.0f} or more"
+        )
     if fault or left_open:
         names = ", ".join(o.name for o in left_open)
         parts = [fault] if fault else []
         if names:
             sigma = displacement(covariance, distance)
             parts.append(
-                f"the motions leave open, in flange axes: {names} (a point at the board is uncertain"
-                f" by {_shown(sigma)})"
+                f"the motions leave open, in flange axes: {names} (a point at the board is "
+                f"uncertain by {_shown(sigma)})"
             )
         return verdict("weak", "; ".join(parts))
     if kept.sum() < 0.6 * len(kept):

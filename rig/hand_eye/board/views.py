@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from rig.hand_eye.board.chain import Chain, X
-from rig.hand_eye.board.noise import Prior
+from rig.hand_eye.board.chain import X
 from rig.hand_eye.board.observations import Observations
-from rig.hand_eye.board.refine import Problem, Solution, inverse_of, normal_equations
+from rig.hand_eye.board.refine import Solution, inverse_of, pixel_blocks
 
 Array = NDArray[np.float64]
 
@@ -150,35 +149,16 @@ def candidate_information(solution: Solution, T: Array, T_camera_board: Array) -
         T, points, np.zeros((count, len(points), 2)), observations.camera, observations.mount,
         joints=joints,
     )  # fmt: skip
-    chain = solution.chain
-    out = np.empty((count, chain.shared, chain.shared))
-    for k in range(count):
-        one = Problem(
-            asked.subset([k]), np.zeros((1, 6)), problem.noise, _nothing(problem),
-            np.ones((1, len(points))), np.ones(1),
-        )  # fmt: skip
-        normal = normal_equations(one, _single(chain))
-        S, _, _ = normal.reduced()
-        S[~solution.normal.free], S[:, ~solution.normal.free] = 0.0, 0.0
-        out[k] = S
-    return out
-
-
-def _nothing(problem: Problem) -> Prior:
-    """The prior that adds nothing: what it bounds is free, what it holds is held."""
-    prior = problem.prior
-    free = tuple(np.inf if sigma > 0 else 0.0 for sigma in prior.lens)
-    return replace(
-        prior,
-        lens=free,
-        size=np.inf if prior.size > 0 else 0.0,
-        clock=np.inf if prior.clock > 0 else 0.0,
-        zero=np.inf if prior.zero > 0 else 0.0,
-    )
-
-
-def _single(chain: Chain) -> Chain:
-    return replace(chain, missed=np.zeros((1, 6)))
+    chain = replace(solution.chain, missed=np.zeros((count, 6)))
+    weights = np.full((count, len(points)), 1 / problem.noise.corner**2)
+    M = pixel_blocks(chain, asked, np.zeros((count, 6)), weights)
+    s = chain.shared
+    D = M[:, s : s + 6, s : s + 6] + np.diag(1 / problem.noise.flange())
+    C = M[:, :s, s : s + 6]
+    added = M[:, :s, :s] - C @ np.linalg.solve(D, np.swapaxes(C, -1, -2))
+    held = ~solution.normal.free
+    added[:, held], added[:, :, held] = 0.0, 0.0
+    return np.asarray(added)
 
 
 def _typical(T_camera_board: Array) -> Array:
