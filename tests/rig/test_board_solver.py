@@ -193,7 +193,7 @@ def test_the_next_pose_does_what_was_promised() -> None:
 def moving(late: float, seed: int) -> Observations:
     """A flange that never stops, its stamps late by so many seconds."""
     rng = np.random.default_rng(seed)
-    stamps = np.arange(60) * 0.1
+    stamps = np.arange(40) * 0.1
     phase = rng.uniform(0, 2 * np.pi, 6)
     rate = rng.uniform(1.0, 1.8, 6)
     size = [0.08, 0.08, 0.06, 0.3, 0.3, 0.5]

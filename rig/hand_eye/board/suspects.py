@@ -201,9 +201,10 @@ def numbering(G: Array, P: Array, points: Array) -> Numbering:
     counts = np.bincount(labels, minlength=4)
     labels = _product(labels)[:, int(np.flatnonzero(labels == np.argmax(counts))[0])]
     plain = pose_misfit(misfit[..., 0])
-    settled = misfit[np.arange(n)[:, None], np.arange(n), _product(labels)]
-    # only what makes an image fit that did not
-    keep = (pose_misfit(settled) < plain / BETTER) & (plain > HOPELESS_R)
+    settled = pose_misfit(misfit[np.arange(n)[:, None], np.arange(n), _product(labels)])
+    # only what makes an image fit that did not, and only where that makes most of them fit
+    keep = (settled < plain / BETTER) & (plain > HOPELESS_R)
+    keep &= float(np.median(settled)) < HOPELESS_R
     labels = np.where(keep, labels, 0)
     return Numbering(np.einsum("nij,njk->nik", P, S[labels]), labels)
 
