@@ -49,7 +49,7 @@ def board_of(dataset: Dataset, text: str | None) -> Board:
         if calibration is None or calibration.get("board") is None:
             raise OptionError(
                 f"{dataset.path}: calibration.json names no board, expected it there or --board,"
-                " as 10x7x0.03"
+                " as 10x7x0.03; --from-depth does without"
             )
         board = Board.from_json(calibration["board"])
     if not SHORTEST <= board.square_m <= LONGEST / min(board.columns, board.rows):

@@ -66,7 +66,7 @@ def images_picture(
         dropped = bool(found.dropped[row])
         name = f"frame {result.observations.ids[row]}"
         ax.set_title(
-            f"{name}: {found.corners[row]:.2f} px" + (", left out: robot" if dropped else ""),
+            f"{name}: {found.corners[row]:.3g} px" + (", left out: robot" if dropped else ""),
             fontsize=9, color=BAD if dropped else "black",
         )  # fmt: skip
         ax.set_xticks([])
@@ -255,7 +255,7 @@ def _some(corners: Array, dropped: NDArray[np.bool_]) -> Sequence[int]:
         return list(range(n))
     first = [int(k) for k in np.flatnonzero(dropped)[: SHEET // 2]]
     first += [int(k) for k in np.argsort(-corners)[:3]]
-    first += [int(k) for k in np.linspace(0, n - 1, n).round()[:: max(1, n // SHEET)]]
+    first += [int(k) for k in np.linspace(0, n - 1, SHEET).round()]
     return sorted(list(dict.fromkeys(first))[:SHEET])
 
 
