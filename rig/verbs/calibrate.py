@@ -56,7 +56,7 @@ class Arguments:
     json: bool = False
     """Print one JSON object on stdout in place of text."""
     with_board: BoardOptions = field(default_factory=BoardOptions)
-    options: Options = field(default_factory=Options)
+    without_board: Options = field(default_factory=Options)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _from_depth(
     from rig.hand_eye.depth.report import content, record_of, text
 
     with Bar(dataset.name, "reading frames") as bar:
-        result = calibrate(dataset, start, arguments.options, lambda i: _show(bar, i))
+        result = calibrate(dataset, start, arguments.without_board, lambda i: _show(bar, i))
     return Found(record_of(result), content(result, dataset), text(result, dataset, run))
 
 

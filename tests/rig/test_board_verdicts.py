@@ -148,6 +148,15 @@ def test_turns_of_a_degree_or_two_are_too_few() -> None:
     assert result.status == "weak" and "turned by only" in result.reason
 
 
+@pytest.mark.parametrize(("intrinsics", "off"), [("fixed", (0.001, 1.5)), ("prior", (0.01, 10.0))])
+def test_another_camera_than_was_stated(intrinsics: str, off: tuple[float, float]) -> None:
+    options = BoardOptions(intrinsics=intrinsics)  # type: ignore[arg-type]
+    assert calibrate(problem(Setup(), 3), options).trusted
+    wrong = calibrate(problem(Setup(camera_off=off), 3), options)
+    assert wrong.status == "inconsistent" and wrong.T is None
+    assert "of another camera than stated" in wrong.reason
+
+
 def test_two_poses_are_refused() -> None:
     o = problem(PLAIN, 0)
     with pytest.raises(DatasetError, match=r"2 poses .* expected 3 or more"):

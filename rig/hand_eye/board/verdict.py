@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from depthba.optimiser.certainty import direction_name
-from rig.hand_eye.board.chain import CLOCK, SIZE, X
-from rig.hand_eye.board.estimate import Estimate
+from rig.hand_eye.board.chain import CLOCK, LENS, SIZE, X
+from rig.hand_eye.board.estimate import UNLIKELY, Estimate
 from rig.hand_eye.board.refine import Solution, minimise
 from rig.hand_eye.board.views import displacement
 from rig.hand_eye.flanges import motion_fault, turned
@@ -28,11 +29,14 @@ together."""
 HOPELESS_T, HOPELESS_R = 0.005, 0.01
 # Corners that miss by more than this, px, are of another camera or another board.
 HOPELESS_CORNER = 3.0
-# A size or a clock is off when it is this many of its standard deviations away, and worth a word
-# from here on: a share, and s.
+# A size or a clock is off when it is this many of its standard deviations away, and worth a
+# word from here on: a share, s, and a share of the focal length or of the image's width.
 CERTAIN = 5.0
+# How far the camera is let go, as a share, to see whether it is the one that was stated.
+LOOSE = 0.01
 # Turns about a second axis (root mean square, rad) below which noise passes for knowledge.
 LITTLE = float(np.radians(3.0))
+LENS_MATTERS = 0.0005
 SIZE_MATTERS, CLOCK_MATTERS = 0.003, 0.001
 
 
@@ -74,6 +78,34 @@ def tested_clock(solution: Solution) -> Tested | None:
     if not np.abs(solution.problem.velocity).max() > 0:
         return None
     return _tested(solution, replace(solution.problem.prior, clock=1.0), CLOCK)
+
+
+def lens_fault(solution: Solution) -> str:
+    """Say by how much the images want another camera than was believed; empty where they do not.
+
+    The focal lengths and the centre are let go ten times as far as a calibrated camera may be off.
+    """
+    believed = np.array(solution.problem.prior.lens[:4])
+    if believed[0] > LOOSE:  # the camera was estimated from these images
+        return ""
+    width = solution.problem.observations.camera.width
+    loose = (LOOSE, LOOSE / 5, LOOSE * width, LOOSE * width, *solution.problem.prior.lens[4:])
+    free = minimise(
+        replace(solution.problem, prior=replace(solution.problem.prior, lens=loose)),
+        solution.chain,
+        20,
+    )
+    off = free.chain.lens[:4]
+    C = free.covariance[LENS, LENS][:4, :4] + np.diag(believed**2)
+    scale = np.sqrt(np.diag(C))
+    distance = off / scale @ np.linalg.solve(C / np.outer(scale, scale), off / scale)
+    matters = np.array([LENS_MATTERS, LENS_MATTERS, *np.full(2, LENS_MATTERS * width)])
+    if distance < chi2.isf(UNLIKELY, 4) or not (np.abs(off) > matters).any():
+        return ""
+    return (
+        f"the images are of another camera than stated: focal length {100 * off[0]:+.2f} %, centre"
+        f" {off[2]:+.1f} {off[3]:+.1f} px; expected its own numbers, or another of --intrinsics"
+    )
 
 
 def _tested(solution: Solution, prior: object, index: int) -> Tested | None:
@@ -178,6 +210,8 @@ def judge(found: Estimate, board: float, distance: float, reach: float) -> Verdi
             f" {1e3 * actual * size.sigma:.2f}), not {1e3 * board:.2f} mm: measure them, or the"
             " camera's focal length is wrong",
         )
+    if lens := lens_fault(solution):
+        return verdict("inconsistent", lens)
     if not solution.converged:
         return verdict("not_converged", "the iterations ended before the transform settled")
     return verdict("converged", "the motions fix the transform")
