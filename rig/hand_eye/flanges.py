@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from depthba import se3
 from depthba.dataset import Dataset
 from depthba.errors import DatasetError
-from depthba.kinematics import UR16E
+from depthba.kinematics import UR16E, DhArm
 
 Array = NDArray[np.float64]
 
@@ -40,20 +40,31 @@ def flange_poses(dataset: Dataset, least: int = 3) -> Array:
     return np.stack(poses)
 
 
-def joint_motions(dataset: Dataset, T_base_flange: Array) -> Array:
-    """Return (6N, n), how the flanges move with the joints, m and rad per rad.
+def known_arm(dataset: Dataset, T_base_flange: Array) -> tuple[DhArm, Array] | None:
+    """Return the arm and the joints (N, n) behind the flange poses; None where it is not known.
 
-    Empty where the frames have no joints, or those of an arm that is not known. An arm calibrated
-    by its maker differs from its drawings by millimetres, and these motions by a hundredth.
+    That is where the frames have no joints, or those of another arm.
     """
     joints = [frame.joints for frame in dataset]
     for arm in ARMS:
         if all(q is not None and len(q) == len(arm.joints) for q in joints):
             q = np.stack([q for q in joints if q is not None])
-            off = se3.difference(arm.forward(q), T_base_flange)
-            if np.abs(off).max() < ALIKE:
-                return arm.jacobian(q).reshape(6 * len(q), -1)
-    return np.zeros((6 * len(joints), 0))
+            if np.abs(se3.difference(arm.forward(q), T_base_flange)).max() < ALIKE:
+                return arm, q
+    return None
+
+
+def joint_motions(dataset: Dataset, T_base_flange: Array) -> Array:
+    """Return (6N, n), how the flanges move with the joints, m and rad per rad.
+
+    Empty where the arm is not known. An arm calibrated by its maker differs from its drawings by
+    millimetres, and these motions by a hundredth.
+    """
+    known = known_arm(dataset, T_base_flange)
+    if known is None:
+        return np.zeros((6 * len(dataset), 0))
+    arm, q = known
+    return arm.jacobian(q).reshape(6 * len(q), -1)
 
 
 def turned(T_base_flange: Array) -> tuple[Array, Array]:

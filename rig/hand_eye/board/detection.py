@@ -13,7 +13,7 @@ from depthba.boards import Board
 from depthba.dataset import Dataset
 from depthba.errors import DatasetError, OptionError
 from rig.hand_eye.board.observations import FEWEST_CORNERS, Mount, Observations
-from rig.hand_eye.flanges import flange_poses, joint_motions
+from rig.hand_eye.flanges import flange_poses, known_arm
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def detect(
             f"{dataset.path}: {len(rows)} of {len(dataset)} frames show the board of"
             f" {board.columns} x {board.rows} inner corners, expected 3 or more"
         )
-    joints = joint_motions(dataset, T_base_flange)
+    arm, q = known_arm(dataset, T_base_flange) or (None, None)
     robot = [frame.record.get("stamp_robot") for frame in dataset]
     known = all(isinstance(stamp, int | float) for stamp in robot)
     observations = Observations(
@@ -117,7 +117,9 @@ def detect(
         ids=dataset.ids,
         stamps=dataset.stamps,
         stamps_robot=np.array(robot, float) if known else None,
-        joints=joints.reshape(len(dataset), 6, -1) if joints.shape[1] else None,
+        joints=None if arm is None or q is None else arm.jacobian(q),
+        arm=arm,
+        q=q,
         velocity=velocities(T_base_flange, dataset.stamps),
     )
     return Detected(observations.subset(rows), tuple(int(r) for r in rows), without)

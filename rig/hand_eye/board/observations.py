@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from depthba import se3
 from depthba.camera import Camera
 from depthba.errors import OptionError
+from depthba.kinematics import DhArm
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,10 @@ class Observations:
     joints: Array | None = None
     """(N, 6, n), how the flanges move with the joints' zeros, m and rad per rad; None where the arm
     is not known."""
+    arm: DhArm | None = None
+    """The arm, where it is known, and"""
+    q: Array | None = None
+    """(N, n), rad, its joints."""
     velocity: Array | None = None
     """(N, 6), m/s and rad/s, base axes, of the flanges at the stamps; None: they stood."""
 
@@ -97,5 +102,6 @@ class Observations:
             stamps=None if self.stamps is None else self.stamps[index],
             stamps_robot=None if self.stamps_robot is None else self.stamps_robot[index],
             joints=None if self.joints is None else self.joints[index],
+            q=None if self.q is None else self.q[index],
             velocity=None if self.velocity is None else self.velocity[index],
         )

@@ -64,11 +64,11 @@ def next_view(solution: Solution) -> NextView | None:
     away = np.linalg.norm(now[:, :3, :3] @ middle + now[:, :3, 3], axis=1)
     candidates = candidate_views(observations, now, middle, away)
     T = flanges(solution, candidates)
-    fits = reachable(observations.T_base_flange, T)
+    fits, joints = reachable(observations, T)
     candidates, T = candidates[fits], T[fits]
     if len(T) == 0:
         return None
-    information = candidate_information(solution, T, candidates)
+    information = candidate_information(solution, T, None if joints is None else joints[fits])
     S, _, _ = solution.normal.reduced()
     distance = float(np.median(away))
     after = [displacement(inverse_of(S + one)[X, X], distance) for one in information]
@@ -126,25 +126,37 @@ def flanges(solution: Solution, T_camera_board: Array) -> Array:
     return np.asarray(G)
 
 
-def reachable(known: Array, T: Array) -> NDArray[np.bool_]:
-    """(C,), whether flanges stay near the region that the arm is known (N, 4, 4) to reach."""
+def reachable(observations: Observations, T: Array) -> tuple[NDArray[np.bool_], Array | None]:
+    """Tell which flanges (C, 4, 4) the arm can have, near the region that it is known to reach.
+
+    Returns:
+        (C,), whether; and how those flanges move with the joints (C, 6, n), where the arm is known.
+    """
+    known = observations.T_base_flange
     p, q = known[:, :3, 3], T[:, :3, 3]
     low, high = p.min(axis=0) - BEYOND, p.max(axis=0) + BEYOND
     within = ((q >= low) & (q <= high)).all(axis=1)
-    return np.asarray(within & (np.linalg.norm(q, axis=1) <= np.linalg.norm(p, axis=1).max()))
+    within &= np.linalg.norm(q, axis=1) <= np.linalg.norm(p, axis=1).max()
+    if observations.arm is None or observations.q is None:
+        return np.asarray(within), None
+    near = np.linalg.norm(q[:, None] - p, axis=-1).argmin(axis=1)
+    joints, found = observations.arm.solve(T, observations.q[near], 1e-9)
+    return np.asarray(within & found), observations.arm.jacobian(joints)
 
 
-def candidate_information(solution: Solution, T: Array, T_camera_board: Array) -> Array:
-    """(C, s, s), what each pose would add to the reduced matrix of what all poses share."""
+def candidate_information(solution: Solution, T: Array, joints: Array | None) -> Array:
+    """(C, s, s), what each pose would add to the reduced matrix of what all poses share.
+
+    Args:
+        solution: so far.
+        T: (C, 4, 4), the flanges.
+        joints: (C, 6, n), how they move with the joints; None: the arm is not known.
+    """
     problem = solution.problem
     observations = problem.observations
     count, points = len(T), observations.points
-    joints = observations.joints
-    if joints is not None:  # of the nearest pose that is known: they change slowly
-        near = np.linalg.norm(
-            T[:, None, :3, 3] - observations.T_base_flange[:, :3, 3], axis=-1
-        ).argmin(axis=1)
-        joints = joints[near]
+    if observations.joints is None:
+        joints = None
     asked = Observations(
         T, points, np.zeros((count, len(points), 2)), observations.camera, observations.mount,
         joints=joints,
