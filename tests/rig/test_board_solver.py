@@ -114,7 +114,7 @@ def test_stored_problems_park_martin_as_opencv_and_the_refinement_ahead_of_all()
 def test_a_few_trials_of_the_study(column: str) -> None:
     """The whole of it is tests/benchmarks/test_hand_eye.py."""
     ours, others, chi2 = [], [], []
-    for seed in range(5):
+    for seed in range(4):
         o = problem(COLUMNS[column], seed)
         result = calibrate(o, BoardOptions(intrinsics="prior" if column == "K off" else "fixed"))
         assert result.trusted and result.T is not None and result.covariance is not None
@@ -123,8 +123,8 @@ def test_a_few_trials_of_the_study(column: str) -> None:
         delta = se3.difference(result.T, X)
         chi2.append(float(delta @ np.linalg.solve(result.covariance, delta)))
     assert (np.median(ours, axis=0) < np.median(others, axis=0)).all()
-    # 30 degrees of freedom: between the 0.1 and 99.9 % quantiles
-    assert 11 < sum(chi2) < 60
+    # 24 degrees of freedom: between the 0.1 and 99.9 % quantiles
+    assert 8 < sum(chi2) < 52
 
 
 def test_intrinsics_from_the_images_alone() -> None:
@@ -193,7 +193,7 @@ def test_the_next_pose_does_what_was_promised() -> None:
 def moving(late: float, seed: int) -> Observations:
     """A flange that never stops, its stamps late by so many seconds."""
     rng = np.random.default_rng(seed)
-    stamps = np.arange(40) * 0.1
+    stamps = np.arange(25) * 0.1
     phase = rng.uniform(0, 2 * np.pi, 6)
     rate = rng.uniform(1.0, 1.8, 6)
     size = [0.08, 0.08, 0.06, 0.3, 0.3, 0.5]
