@@ -147,15 +147,23 @@ def test_bad_poses_and_bad_corners_are_found_and_left_out() -> None:
     T[bad] = se3.retract(T[bad], rng.choice([-1, 1], (4, 6)) * np.repeat([0.003, 0.01], 3))
     T[bad[0], 0, 3] += 0.2
     pixels[3, 5] += [10.0, 4.0]
+    pixels[9] += 30.0 * rng.standard_normal(pixels[9].shape)
     pixels[4, :9] = np.nan
     result = calibrate(replace(clean, T_base_flange=T, pixels=pixels))
     assert result.trusted and result.T is not None and result.estimate is not None
     assert list(np.flatnonzero(result.estimate.dropped)) == bad
-    assert any("2, 7, 11, 15" in note for note in result.notes)
+    assert any("flange poses do not fit the rest: frames 2, 7, 11, 15" in n for n in result.notes)
+    assert any("corners do not fit the rest: frames 9" in note for note in result.notes)
     weights = result.estimate.solution.problem.corner_weights
     assert weights[3, 5] == 0 and weights[4, :9].sum() == 0 and weights[4, 9:].min() == 1
-    degrees, mm = error(result.T)
-    assert degrees < 0.09 and mm < 0.4
+    # as good as the others alone would have it
+    assert result.covariance is not None
+    delta = se3.difference(result.T, X)
+    assert delta @ np.linalg.solve(result.covariance, delta) < 22
+    others = calibrate(clean.subset([k for k in range(20) if k not in (*bad, 9)]))
+    assert others.T is not None
+    degrees, mm = error(result.T, others.T)
+    assert degrees < 0.03 and mm < 0.15
     noise = result.estimate.solution.problem.noise
     assert noise.corner == pytest.approx(0.3, rel=0.05)
     assert noise.robot_t == pytest.approx(5e-5, rel=0.5)

@@ -193,9 +193,9 @@ def calibrate(
         notes += _stamp_notes(observations)
     away = np.linalg.norm(P[:, :3, 3], axis=1)
     verdict = judge(found, square, float(np.median(away)), prior.reach)
-    gone = [str(observations.ids[i]) for i in np.flatnonzero(found.dropped)]
-    if gone:
-        notes.append(f"left out, their flange poses do not fit the rest: frames {', '.join(gone)}")
+    for out, what in ((found.dropped, "flange poses"), (found.spoilt, "corners")):
+        if names := ", ".join(str(observations.ids[i]) for i in np.flatnonzero(out)):
+            notes.append(f"left out, their {what} do not fit the rest: frames {names}")
     return BoardHandEye(
         status=verdict.status,
         reason=verdict.reason,

@@ -64,6 +64,11 @@ class Estimate:
     """(N,), px, root mean square of each picture's residuals over coordinates, kept corners."""
 
     @property
+    def spoilt(self) -> NDArray[np.bool_]:
+        """(N,), pictures of which most corners fit nothing, so that none is believed."""
+        return np.asarray(~(self.solution.problem.corner_weights > 0).any(axis=1))
+
+    @property
     def X(self) -> Array:
         """(4, 4)."""
         return self.solution.chain.X
@@ -110,7 +115,8 @@ def estimate(
     kept &= (kept.sum(axis=1) >= 0.5 * seen.sum(axis=1))[:, None]  # else the picture is spoilt
     if not kept.any():
         raise OptionError("no corner fits any pose, expected corners of one board")
-    dropped = _too_far(solution)
+    pictured = kept.any(axis=1)  # of the others nothing is left but the robot's word
+    dropped = _too_far(solution) & pictured
     for _ in range(3):
         problem = replace(
             solution.problem,
@@ -119,10 +125,11 @@ def estimate(
         )
         solution = _settle(problem, solution.chain, stated, heavy=False)
         distance = distances(solution)
-        worse = distance > chi2.isf(UNLIKELY, 6)
+        worse = (distance > chi2.isf(UNLIKELY, 6)) & pictured
         if (worse == dropped).all() or (~worse).sum() < max(3, n // 2):
             break
         dropped = worse
+    dropped = solution.problem.pose_weights == 0
     square = np.where(kept, np.square(_lengths(solution)), 0.0).sum(axis=1)
     corners = np.sqrt(square / np.maximum(2 * kept.sum(axis=1), 1))
     return Estimate(solution, stated, distances(solution), dropped, corners)

@@ -80,7 +80,7 @@ def _numbers(result: BoardHandEye) -> dict[str, Any]:
         "board_size": None if size is None else {"log": size.value, "sigma": size.sigma},
         "clock_s": None if clock is None else {"late": clock.value, "sigma": clock.sigma},
         "methods": {name: X.tolist() for name, X in result.methods.items() if np.isfinite(X).all()},
-        "drop": [observations.ids[k] for k in np.flatnonzero(estimate.dropped)],
+        "drop": [observations.ids[k] for k in np.flatnonzero(estimate.dropped | estimate.spoilt)],
         "add": None
         if following is None
         else {
