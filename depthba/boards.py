@@ -72,6 +72,35 @@ class Board:
         return Board("charuco", columns, rows, square_m, "DICT_4X4_50", 0.75 * square_m)
 
     @staticmethod
+    def parse(text: str) -> Board:
+        """The board of words such as ``10x7x0.03``: inner corners along x and y, m a square.
+
+        ``charuco:10x7x0.03`` is a ChArUco board as `charuco` makes it; a dictionary and a marker's
+        side, m, may follow: ``charuco:10x7x0.03:DICT_5X5_100:0.022``. OptionError says what is
+        wrong.
+        """
+        kind, _, rest = text.rpartition(":") if text.count(":") == 0 else text.partition(":")
+        sizes, *markers = rest.split(":")
+        numbers = sizes.lower().split("x")
+        try:
+            columns, rows, square = int(numbers[0]), int(numbers[1]), float(numbers[2])
+            if len(numbers) != 3 or kind not in ("", *KINDS):
+                raise ValueError
+            if kind != "charuco":
+                if markers:
+                    raise ValueError
+                return Board("checkerboard", columns, rows, square)
+            plain = Board.charuco(columns, rows, square)
+            dictionary = markers[0] if markers else plain.dictionary
+            marker = float(markers[1]) if len(markers) > 1 else plain.marker_m
+        except (ValueError, IndexError):
+            raise OptionError(
+                f"board {text!r}: expected inner corners along x and y and the side of a square in"
+                " metres, as 10x7x0.03 or charuco:10x7x0.03"
+            ) from None
+        return Board("charuco", columns, rows, square, dictionary, marker)
+
+    @staticmethod
     def from_json(value: Any) -> Board:  # JSON is untyped until it is checked
         """The board of calibration.json's key `board`. OptionError names what is wrong with it."""
         try:

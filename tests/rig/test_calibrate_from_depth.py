@@ -12,7 +12,7 @@ from depthba import se3
 from depthba.cli import main
 from depthba.dataset import Dataset
 from depthba.errors import OptionError
-from rig.hand_eye.from_depth import HandEye, Options, calibrate
+from rig.hand_eye.depth.calibration import HandEye, Options, calibrate
 from tests.rig.arm_scene import WRONG, X, write_arm
 
 OPTIONS = Options(resolution=0.016, threads=1)

@@ -8,9 +8,10 @@ import pytest
 from depthba import se3
 from depthba.kinematics import UR16E
 from depthba.optimiser.prior import move
-from rig.hand_eye.believed import Beliefs, estimate, posterior
-from rig.hand_eye.chain import Chain, without_gauge
-from rig.hand_eye.verdict import motion_fault, open_directions, turned
+from rig.hand_eye.depth.believed import Beliefs, estimate, posterior
+from rig.hand_eye.depth.chain import Chain, without_gauge
+from rig.hand_eye.depth.verdict import open_directions
+from rig.hand_eye.flanges import motion_fault, turned
 from tests.rig.arm_scene import X, flanges
 
 N = 4

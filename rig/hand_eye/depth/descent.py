@@ -19,7 +19,7 @@ from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.solver import solve_map
 from depthba.optimiser.workers import Workers
-from rig.hand_eye.chain import Chain, without_gauge
+from rig.hand_eye.depth.chain import Chain, without_gauge
 
 Array = NDArray[np.float64]
 

@@ -18,10 +18,10 @@ from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, r
 from depthba.optimiser.problem import BLOCKS
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.workers import Workers
-from rig.hand_eye.believed import Beliefs, estimate, newton_step
-from rig.hand_eye.chain import Chain, without_gauge
-from rig.hand_eye.descent import Descent, Iteration, Start
-from rig.hand_eye.pattern import Answers, Waves, answers
+from rig.hand_eye.depth.believed import Beliefs, estimate, newton_step
+from rig.hand_eye.depth.chain import Chain, without_gauge
+from rig.hand_eye.depth.descent import Descent, Iteration, Start
+from rig.hand_eye.depth.pattern import Answers, Waves, answers
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,56 +10,30 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.dataset import Dataset
-from depthba.errors import OptionError
 from depthba.verbs.output import length
-from rig.hand_eye.from_depth import HandEye
+from rig.hand_eye.depth.calibration import HandEye
+from rig.hand_eye.record import FILE, HandEyeRecord, head
 
-FILE = "hand_eye.json"
 
-
-def read_transform(path: Path) -> NDArray[np.float64]:
-    """Read T_flange_camera (4, 4) from JSON.
-
-    The file holds the 4x4 itself, or an object with it under that name, as hand_eye.json and
-    dataset.json do.
-
-    Raises:
-        OptionError: there is none, or it is not rigid.
-    """
-    try:
-        raw = json.loads(path.read_text())
-        if isinstance(raw, dict):
-            raw = raw["T_flange_camera"]
-        T = np.array(raw, dtype=float)
-    except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
-        raise OptionError(
-            f"--start {path}: no T_flange_camera in it, expected JSON with a 4x4 of that name"
-        ) from error
-    if not se3.is_rigid(T):
-        raise OptionError(f"--start {path}: T_flange_camera is not rigid, expected a 4x4 in metres")
-    return T
+def record_of(result: HandEye) -> HandEyeRecord:
+    """Return what both roads have in common."""
+    return HandEyeRecord(
+        method="from-depth",
+        mount="eye-in-hand",
+        verdict=result.status,
+        trusted=result.trusted,
+        reason=result.reason,
+        T=result.T_flange_camera,
+        covariance=result.covariance,
+        open=result.open,
+    )
 
 
 def content(result: HandEye, dataset: Dataset) -> dict[str, Any]:
     """Return what hand_eye.json holds: m and rad but for what is named otherwise."""
-    sigma = np.sqrt(np.diag(result.covariance))
     moved = se3.difference(result.T_flange_camera, result.T_flange_camera_start)
     return {
-        "format": "depthba-hand-eye",
-        "version": 1,
-        "dataset": str(dataset.path.resolve()),
-        "method": "from-depth",
-        "verdict": result.status,
-        "trusted": result.trusted,
-        "reason": result.reason,
-        "open": [
-            {"name": o.name, "direction": o.direction.tolist(), "share": o.share}
-            for o in result.open
-        ],
-        "T_flange_camera": result.T_flange_camera.tolist(),
-        "sigma_mm": (1e3 * sigma[:3]).tolist(),
-        "sigma_deg": np.degrees(sigma[3:]).tolist(),
-        "covariance": result.covariance.tolist(),
+        **head(record_of(result), dataset),
         "T_flange_camera_start": result.T_flange_camera_start.tolist(),
         "moved_mm": float(1e3 * np.linalg.norm(moved[:3])),
         "moved_deg": float(np.degrees(np.linalg.norm(moved[3:]))),

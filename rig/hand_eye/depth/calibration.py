@@ -21,12 +21,14 @@ from depthba.optimiser.bends import without_bends
 from depthba.optimiser.level import level_heights, make_level
 from depthba.optimiser.workers import Workers
 from depthba.options import Options as MapOptions
-from rig.hand_eye.believed import Beliefs
-from rig.hand_eye.descent import Iteration, Start, descend
-from rig.hand_eye.joint import Joint, solve
-from rig.hand_eye.pattern import waves_of
-from rig.hand_eye.problem import set_up
-from rig.hand_eye.verdict import Open, Status, judge, turned
+from rig.hand_eye.depth.believed import Beliefs
+from rig.hand_eye.depth.descent import Iteration, Start, descend
+from rig.hand_eye.depth.joint import Joint, solve
+from rig.hand_eye.depth.pattern import waves_of
+from rig.hand_eye.depth.problem import set_up
+from rig.hand_eye.depth.verdict import Status, judge
+from rig.hand_eye.flanges import turned
+from rig.hand_eye.record import Open
 
 Array = NDArray[np.float64]
 

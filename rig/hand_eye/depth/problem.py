@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.dataset import Dataset
-from depthba.errors import DatasetError
-from depthba.kinematics import UR16E
 from depthba.optimiser.problem import Problem, Roi, choose_map_frame, prepare
-from rig.hand_eye.chain import Chain
+from rig.hand_eye.depth.chain import Chain
+from rig.hand_eye.flanges import flange_poses, joint_motions
 
 Array = NDArray[np.float64]
 
@@ -20,30 +19,6 @@ Array = NDArray[np.float64]
 ENOUGH = 1_000_000
 # Points that are this many times as noisy as the typical one are left out.
 NOISY = 3.0
-# Arms whose kinematics are known, and how close to them the reported flanges must be, m and rad.
-ARMS = (UR16E,)
-ALIKE = 0.02
-
-
-def flange_poses(dataset: Dataset) -> Array:
-    """Return (N, 4, 4) T_base_flange.
-
-    Raises:
-        DatasetError: a frame has none.
-    """
-    poses = []
-    for frame in dataset:
-        if frame.T_base_flange is None:
-            raise DatasetError(
-                f"{dataset.path}: frame {frame.id} has no T_base_flange in frames.jsonl; "
-                "hand-eye calibration needs the robot's flange pose of every frame"
-            )
-        poses.append(frame.T_base_flange)
-    if len(poses) < 3:
-        raise DatasetError(
-            f"{dataset.path}: {len(poses)} frames, but hand-eye calibration needs at least 3"
-        )
-    return np.stack(poses)
 
 
 def set_up(dataset: Dataset, T_flange_camera: Array, sigma: Array) -> tuple[Problem, Chain]:
@@ -118,19 +93,3 @@ def near_box(dataset: Dataset, T_world_camera: Array, sigma: Array) -> Roi | Non
     return (
         float(low[0]), float(high[0]), float(low[1]), float(high[1]), float(low[2]), float(high[2])
     )  # fmt: skip
-
-
-def joint_motions(dataset: Dataset, T_base_flange: Array) -> Array:
-    """Return (6N, n), how the flanges move with the joints, m and rad per rad.
-
-    Empty where the frames have no joints, or those of an arm that is not known. An arm calibrated
-    by its maker differs from its drawings by millimetres, and these motions by a hundredth.
-    """
-    joints = [frame.joints for frame in dataset]
-    for arm in ARMS:
-        if all(q is not None and len(q) == len(arm.joints) for q in joints):
-            q = np.stack([q for q in joints if q is not None])
-            off = se3.difference(arm.forward(q), T_base_flange)
-            if np.abs(off).max() < ALIKE:
-                return arm.jacobian(q).reshape(6 * len(q), -1)
-    return np.zeros((6 * len(joints), 0))

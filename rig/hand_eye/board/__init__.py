@@ -1,0 +1,1 @@
+"""Hand-eye calibration with a board: from colour images of it and the flange poses."""
