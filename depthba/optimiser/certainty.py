@@ -12,6 +12,7 @@ from depthba.optimiser import coupling, pattern, probes, reduced
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
+from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
 from depthba.optimiser.workers import Workers
@@ -78,6 +79,7 @@ def correlation(
     workers: Workers,
     reduction: reduced.Reduction | None = None,
     believed: pattern.Believed | None = None,
+    patches: Patches | None = None,
 ) -> Correlation:
     """Measure how the residuals' correlation over the image inflates the variance of the poses.
 
@@ -91,7 +93,8 @@ def correlation(
 
     A fixed pattern that was ``believed`` in and solved for is eliminated as the map is. It leaves
     little that all frames have in common, so blocks count that are dealt out anew for each frame,
-    too, and whichever of the two says more.
+    too, and whichever of the two says more. ``patches``, fitted at the state, say what they say
+    beside the map; the reduction holds it.
     """
     reduction = reduction or reduced.reduce(lin, workers)
     S = reduction.S if believed is None else believed.eliminated(reduction.S)
@@ -115,6 +118,8 @@ def correlation(
             workers,
         )  # fmt: skip
         scores = scores + believed.follow(own)
+    if patches is not None:
+        scores = scores + patches.scores(state.T_map_camera, lin.pivots, groups, count, workers)
     scores = scores[..., keep]
     scores = scores - scores.mean(axis=1, keepdims=True)
     variance = robust_sigma(lin.residuals) ** 2
@@ -261,7 +266,7 @@ def assess(
     about_pivots = np.zeros((6 * n, 6 * n))
     # without belief in the prior a trace of it stays, so that open directions are large and not
     # infinite
-    about_pivots[np.ix_(keep, keep)] = posterior if believed else np.linalg.inv(data + 1e-12 * held)
+    about_pivots[np.ix_(keep, keep)] = posterior if believed else np.linalg.inv(data + 1e-6 * held)
     for i in np.flatnonzero(~free):
         if prior.information[i].any():
             inverse = np.linalg.inv(J[i])

@@ -52,6 +52,9 @@ def conclude(
     acting = engine.acting
     cost_start = began_lin.cost + end.temperature * acting.cost(T_camera_start)
     cost_end = outcome_lin.cost + end.temperature * acting.cost(outcome.state.T_map_camera)
+    if outcome.tied is not None:
+        cost_start += outcome.tied.patches.fitted(T_camera_start, workers).cost
+        cost_end += outcome.tied.cost
     better = cost_end <= cost_start
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")

@@ -20,6 +20,7 @@ from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
+from depthba.optimiser.tying import patches_beside, tied_by_patches
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration
@@ -29,6 +30,9 @@ from depthba.result import Iteration
 WIDE = 12.0
 # A level that only leads to the next is left when a step gains less than this share of its cost.
 GAIN = 0.02
+# The last one is, with patches on it, below this share: their points and the map's robust tails
+# never quite settle.
+ENOUGH = 0.003
 # Where the estimate owes the measured poses less than this in every direction, their exact weight
 # is of no account.
 NEGLIGIBLE = 0.002
@@ -140,19 +144,30 @@ class Engine:
         levels = list(levels)
         for index in count():
             last = index == len(levels) - 1 or self.clock.over
+            if last and index:
+                poses = self._tied(poses, levels[index], known)
             level, state, lin = self._lay(levels[index], poses, before, last)
             for phase in phases(1 if refining else index, self.preset):
+                if last and phase == phases(1, self.preset)[-1]:
+                    level = self._patched(level, state, lin)
                 near = reduced.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
-                final = last and phase == phases(1, self.preset)[-1]
+                final = last and phase == phases(1, self.preset)[-1] and not level.tied
                 temperature, outcome = self._descend(
                     level, state, lin, near, phase, index, len(levels), known, final
                 )
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
+                if level.tied:
+                    # where the poses have got to, patches lie better
+                    level = self._patched(level, state, lin)
+                    near = reduced.reduce(lin, self.workers, NEAR, self.free)
+                    temperature, outcome = self._descend(
+                        level, state, lin, near, phase, index, len(levels), known, True
+                    )
                 break
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
             if known and self.options.resolution is None:
@@ -179,6 +194,7 @@ class Engine:
                 level, state, lin = self._lay(
                     finer, state.T_map_camera, Map(state.heights, level.grid), True
                 )
+            level = self._patched(level, state, lin)
             near = reduced.reduce(lin, self.workers, NEAR, self.free)
             temperature, outcome = self._descend(
                 level, state, lin, near, phase, index, index + 1, known, True
@@ -219,6 +235,38 @@ class Engine:
             level.problem, level.grid, state, level.loss, level.smooth, self.workers, 1, NEAR
         )
 
+    def _tied(
+        self, poses: NDArray[np.float64], spacing: float, known: certainty.Correlation | None
+    ) -> NDArray[np.float64]:
+        """Return the poses as patches alone would have them."""
+        if not self.preset.robust or self.clock.over:
+            return poses
+        poses = tied_by_patches(
+            self.problem, poses, spacing, self.prior, self.acting,
+            known.inflation if known else 1.0, self.free, self.workers,
+        )  # fmt: skip
+        self.clock.lap("patches")
+        return poses
+
+    def _patched(self, level: Level, state: State, lin: Linearisation) -> Level:
+        """Return the level with patches laid anew over what its map cannot hold."""
+        if not self.preset.robust:
+            return level
+        tied = patches_beside(
+            self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
+            robust_sigma(lin.residuals), self.workers,
+        )  # fmt: skip
+        return replace(level, tied=tied)
+
+    def _with_patches(
+        self, level: Level, state: State, lin: Linearisation, at: reduced.Reduction
+    ) -> reduced.Reduction:
+        """Return the reduction with what the patches say in its matrix."""
+        if level.tied is None:
+            return at
+        told, _ = level.tied.patches.normal_equations(state.T_map_camera, lin.pivots, self.workers)
+        return replace(at, S=at.S + told)
+
     def _descend(
         self, level: Level, state: State, lin: Linearisation, near: reduced.Reduction, phase: str,
         index: int, levels: int, known: certainty.Correlation | None, final: bool,
@@ -239,10 +287,12 @@ class Engine:
             problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
         lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
         at = reduced.reduce(lin, self.workers, free=self.free)
+        at = self._with_patches(level, state, lin, at)
         believed = self._believed(problem, level.grid, state, loss, lin, at)
         found = certainty.correlation(
-            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at, believed
-        )
+            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at,
+            believed, level.tied.patches if level.tied else None,
+        )  # fmt: skip
         self.clock.lap("certainty")
         return Known(problem, lin, found, believed)
 
@@ -302,7 +352,8 @@ class Engine:
             _scale(self.preset, phase),
             self.options.max_iterations,
             settled=self.settled if final else PASSING,
-            gain=0.0 if final else GAIN,
+            steady=final and level.tied is not None,
+            gain=(ENOUGH if level.tied else 0.0) if final else GAIN,
             believed=believed,
         )
 
@@ -318,7 +369,7 @@ class Engine:
         return solve_level(
             level.problem, level.grid, state, lin, level.loss, rules, self.acting, temperature,
             self.free, level.smooth, self.workers, report, near, sure,
-            lambda: self.clock.over,
+            lambda: self.clock.over, level.tied,
         )  # fmt: skip
 
     def _sure(
@@ -329,8 +380,12 @@ class Engine:
         if not self.preset.prior or self.noisy * FINER < NOISY:
             return None
         matrix, _ = self.prior.normal_equations(state.T_map_camera, lin.pivots)
+        held = temperature * matrix
+        if level.tied is not None:
+            patches = level.tied.patches
+            held = held + patches.normal_equations(state.T_map_camera, lin.pivots, self.workers)[0]
         less, self.noisy = without_slope_noise(
-            level.problem, level.grid, state, level.loss, lin, S, temperature * matrix,
+            level.problem, level.grid, state, level.loss, lin, S, held,
             self.free, self.workers, share=NOISY,
         )  # fmt: skip
         return None if less is S else less
@@ -340,7 +395,7 @@ class Engine:
     ) -> certainty.Correlation:
         return certainty.correlation(
             level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,
-            at,
+            self._with_patches(level, state, lin, at),
         )  # fmt: skip
 
 

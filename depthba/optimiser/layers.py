@@ -31,12 +31,10 @@ def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: 
     point's noise grows with it. The weight hangs on the point, not on the cell: one that changes
     cell keeps it, so nothing is gained by moving.
     """
-    grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
-    rough = scatter(problem, T_map_camera, grid)
-    typical = float(np.median(rough[rough > 0])) if (rough > 0).any() else 0.0
-    if typical == 0.0:
+    rough, grid = roughness(problem, T_map_camera, spacing)
+    if not rough.any():
         return problem
-    factor = 1.0 / np.maximum(1.0, rough / (USUAL * typical))
+    factor = 1.0 / np.maximum(1.0, rough)
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         points = frame.points.copy()
@@ -47,6 +45,27 @@ def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: 
         points[:, 4] *= a**2
         frames.append(replace(frame, points=points))
     return replace(problem, frames=tuple(frames))
+
+
+def rough_points(
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
+) -> list[NDArray[np.bool_]]:
+    """Say of each frame, (n,), which of its points lie in cells that one height cannot describe."""
+    rough, grid = roughness(problem, T_map_camera, spacing)
+    return [
+        _look_up(rough, f.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid) > 1.0
+        for f, T in zip(problem.frames, T_map_camera, strict=True)
+    ]
+
+
+def roughness(
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
+) -> tuple[NDArray[np.float64], Grid]:
+    """Return (ny, nx) the scatter within cells over what passes for noise, and the cells."""
+    grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
+    rough = scatter(problem, T_map_camera, grid)
+    typical = float(np.median(rough[rough > 0])) if (rough > 0).any() else 0.0
+    return rough / (USUAL * typical) if typical else np.zeros(grid.shape), grid
 
 
 def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:

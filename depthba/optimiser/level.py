@@ -11,6 +11,7 @@ from depthba.optimiser import schedule
 from depthba.optimiser.grid import Averages, Grid, average, filled, make_grid, near, resample
 from depthba.optimiser.layers import down_weighted
 from depthba.optimiser.linearise import Loss
+from depthba.optimiser.patches import Fit
 from depthba.optimiser.problem import Problem
 from depthba.options import Options
 
@@ -24,6 +25,8 @@ class Level:
     averages: Averages
     smooth: NDArray[np.bool_]
     loss: Loss
+    tied: Fit | None = None
+    """Patches that tie the frames where a map cannot; None: there are none."""
 
 
 def make_level(

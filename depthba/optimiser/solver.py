@@ -17,6 +17,7 @@ from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.mixing import Mixer
+from depthba.optimiser.patches import Fit
 from depthba.optimiser.prior import PosePrior, move
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.stencil import MapSolver
@@ -46,6 +47,9 @@ class Rules:
     settled: float = 0.1
     """Converged when what is left to go is below this many standard deviations of the poses (root
     mean square)."""
+    steady: bool = False
+    """Whether the robust loss stays as wide as the start has it: it would chase the residuals that
+    it lets go of."""
     gain: float = 0.0
     """Enough when a step lowers the cost by less than this share: a coarse level only has to bring
     the next into reach."""
@@ -80,6 +84,8 @@ class Outcome:
     loss: Loss
     converged: bool
     sigma: float
+    tied: Fit | None = None
+    """The patches at its poses."""
 
 
 def solve_map(
@@ -117,6 +123,7 @@ def solve_level(
     near: NDArray[np.float64] | None = None,
     sure: NDArray[np.float64] | None = None,
     over: Callable[[], bool] = lambda: False,
+    tied: Fit | None = None,
 ) -> Outcome:
     """Iterate to convergence on one grid with one loss.
 
@@ -137,7 +144,14 @@ def solve_level(
         near: (6N, 6N) the reduced matrix about where the level starts, if known.
         sure: (6N, 6N) what of it is not noise in the map's slope; None: all of it.
         over: asked before each iteration but the first whether to end.
+        tied: patches that tie the frames beside the map, fitted where the level starts.
     """
+
+    def beside(T_map_camera: NDArray[np.float64]) -> tuple[float, Fit | None]:
+        """Return what poses cost beside the map, m^2, and the patches there."""
+        fit = None if tied is None else tied.patches.fitted(T_map_camera, workers)
+        return temperature * prior.cost(T_map_camera) + (fit.cost if fit else 0.0), fit
+
     sigma = robust_sigma(lin.residuals)
     loss = judge = _rescaled(loss, rules, sigma)
     lin = linearise(problem, grid, state, loss, workers, smooth, spare=lin)
@@ -154,6 +168,10 @@ def solve_level(
             break
         matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
         believed = temperature * matrix, temperature * gradient
+        told = None
+        if tied is not None:
+            told, pull = tied.patches.normal_equations(state.T_map_camera, lin.pivots, workers)
+            believed = believed[0] + told, believed[1] + pull
         direct = sure is None and reduced.direct_is_shorter(lin)
         here = reduced.reduce(lin, workers, free=free) if direct else None
         step = eliminate.solve(
@@ -161,19 +179,23 @@ def solve_level(
         )
         length = float(np.sqrt(max(step.decrement, 0.0)))
         metric = here.S if here is not None else near
+        if metric is not None and told is not None:
+            metric = metric + told
         mixed = step if metric is None or damping > 0 else mixer.mix(step, metric)
         candidate = State(
             move(state.T_map_camera, lin.pivots, mixed.pose), state.heights + mixed.map
         )
         after = linearise(problem, grid, candidate, loss, workers, smooth, judge, spare)
         before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
+        before_cost += tied.cost if tied else 0.0
         # steps that shrink by the same factor leave a geometric series to go
         left = length * pace / (1 - pace)
         deviation = np.sqrt(dof * max(rules.believed * sigma**2, 1e-30))
         small = left < rules.settled * deviation
         # with the nodal gradient the cost may rise in the last digits while the poses still settle
         most = before_cost * (1 + (1e-3 if small else 1e-6)) + unlearnt
-        after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+        aside, fit = beside(candidate.T_map_camera)
+        after_cost = after.judged + aside
         for _ in range(FOLLOW):
             if after_cost <= most:
                 break
@@ -181,7 +203,7 @@ def solve_level(
             candidate, after = _map_followed(
                 problem, grid, candidate, after, loss, smooth, workers, judge
             )
-            after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+            after_cost = after.judged + aside
         for share in SHORTER:
             if after_cost <= most:
                 break
@@ -189,7 +211,8 @@ def solve_level(
             heights = state.heights + share * mixed.map
             candidate = State(move(state.T_map_camera, lin.pivots, share * mixed.pose), heights)
             after = linearise(problem, grid, candidate, loss, workers, smooth, judge, after)
-            after_cost = after.judged + temperature * prior.cost(candidate.T_map_camera)
+            aside, fit = beside(candidate.T_map_camera)
+            after_cost = after.judged + aside
         # points that change cells or fall off edges make the cost rough on a small scale: what the
         # last steps gained may be spent on getting over that (Grippo, Lampariello & Lucidi 1986)
         accepted = after_cost <= max(most, before_cost * min(gained, LEAP))
@@ -201,10 +224,12 @@ def solve_level(
             mixer.took(mixed)
             state, lin, spare, judge = candidate, after, lin, loss
             sigma = robust_sigma(lin.residuals)
-            loss = _rescaled(
-                loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma
-            )
+            if not (rules.steady and rules.robust):
+                loss = _rescaled(
+                    loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma
+                )
             damping = damping / 10 if damping > 1e-3 else 0.0
+            tied = fit
         else:
             spare = after
             if mixed is step:
@@ -217,7 +242,7 @@ def solve_level(
             break
         if damping > 1e6:
             break
-    return Outcome(state, lin, loss, converged, sigma)
+    return Outcome(state, lin, loss, converged, sigma, tied)
 
 
 def _map_followed(

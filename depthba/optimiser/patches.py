@@ -1,0 +1,383 @@
+"""Quadric patches in 3-D, seen by several frames: what steep and small things say about the poses.
+
+The map holds one height per node. Walls, edges and small things it can only blur; and where the
+rest is flat, they are all that holds the frames sideways. Here points are sorted into voxels, and
+where those of each frame by itself lie on something flat enough to have a side, the frames are tied
+to a common quadric over it. Its coefficients are eliminated in closed form, as the heights of the
+map are.
+
+Which way a patch faces is read from the scatter *within* frames: misaligned poses do not blur it.
+Every point counts by how far it lies off the surface (Geman & McClure 1987), so that a voxel may
+hold edges and strays. Planes in voxels are those of BALM (Liu & Zhang 2021), less the curvature and
+the robust loss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser import patch_kernels
+from depthba.optimiser.problem import Problem
+from depthba.optimiser.workers import SHARES, Workers
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Fewest points of a frame in a patch, and fewest frames.
+FEWEST, SEVERAL = 6, 2
+# The second axis of a patch is at least this many times its thickness, and this share of the voxel.
+FLAT, WIDE = 2.0, 0.1
+# Least scale of the loss, in standard deviations of the noise times its factor.
+LEAST = 0.3
+# A patch whose normal is closer to the map's z axis (cosine) says what the map says better.
+LEVEL = 0.9
+# How far a point is walked to its surface at most, in sides of its voxel.
+REACH = 0.5
+# Rounds of reweighting in a fit that starts near, and in one that starts from nothing.
+NEAR, AFRESH = 2, 4
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Surfaces seen by several frames. Points are sorted by patch, and by frame within a patch.
+
+    A *view* is a frame's points in a patch.
+    """
+
+    points: Array
+    """(n, 3), sensor frame, m."""
+    weights: Array
+    """(n,), inverse variance relative to the typical one."""
+    source: Ints
+    """(n,), index of each point among those of its frame."""
+    ends: Ints
+    """(m + 1,), where the points of each view begin and end."""
+    frame: Ints
+    """(m,), the frame of each view."""
+    views: Ints
+    """(k + 1,), where the views of each patch begin and end."""
+    axes: Array
+    """(k, 3, 3), columns: normal and two directions along the patch; a rotation."""
+    centre: Array
+    """(k, 3), map frame, m: where the surface is expanded."""
+    reach: Array
+    """(k,), m, how far a point is walked to its surface at most."""
+    stiff: Array
+    """(k,), m^4, what a squared second-order coefficient costs."""
+    surface: Array
+    """(k, 6), coefficients of the surfaces at the poses where they were fitted last."""
+    robust: float
+    """Scale of the robust loss in robust standard deviations of the residuals."""
+    scale: float
+    """The same in m; 0: no such loss."""
+    rays: bool
+    """Whether points lie on rays from the origin of their sensor."""
+    frames: int
+    """N, all frames of the problem."""
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    @property
+    def deviation(self) -> float:
+        """Robust standard deviation of the residuals that the loss goes by, m."""
+        return self.scale / self.robust
+
+    def fitted(self, T_map_camera: Array, workers: Workers, rounds: int = NEAR) -> Fit:
+        """Return the surfaces that fit best at poses (N, 4, 4), and what they cost."""
+        Q, o = self._local(T_map_camera)
+        surface = self.surface.copy()
+
+        def of(share: tuple[int, int]) -> float:
+            return float(
+                patch_kernels.fit(
+                    *share, self.points, self.weights, self.ends, self.views, Q, o, self.reach,
+                    self.stiff, self.rays, self.scale**2, rounds, surface,
+                )
+            )  # fmt: skip
+
+        cost = float(sum(workers.map(of, self._shares())))
+        return Fit(replace(self, surface=surface), cost)
+
+    def true(self, T_map_camera: Array, workers: Workers, most: float) -> Patches:
+        """Return the steep patches whose points lie on their surface but for noise.
+
+        Args:
+            T_map_camera: (N, 4, 4), where the surfaces were fitted.
+            workers: the threads.
+            most: median distance from the surface of the points of a patch, m.
+        """
+        level = np.abs(self.axes[:, 2, 0]) > LEVEL
+        off = self._off(T_map_camera, workers)
+        patch = np.repeat(np.arange(len(self)), np.diff(self.ends[self.views]))
+        order = np.lexsort((np.abs(off), patch))
+        ends = self.ends[self.views]
+        median = np.abs(off)[order][(ends[:-1] + ends[1:]) // 2]
+        return self._only((median <= most) & ~level)
+
+    def _only(self, these: NDArray[np.bool_]) -> Patches:
+        """Return some of the patches."""
+        views = np.repeat(these, np.diff(self.views))
+        points = np.repeat(views, np.diff(self.ends))
+        return replace(
+            self,
+            points=self.points[points],
+            weights=self.weights[points],
+            source=self.source[points],
+            ends=np.concatenate([[0], np.cumsum(np.diff(self.ends)[views])]),
+            frame=self.frame[views],
+            views=np.concatenate([[0], np.cumsum(np.diff(self.views)[these])]),
+            axes=self.axes[these],
+            centre=self.centre[these],
+            reach=self.reach[these],
+            stiff=self.stiff[these],
+            surface=self.surface[these],
+        )
+
+    def rescaled(self, T_map_camera: Array, workers: Workers, sigma: float) -> Fit:
+        """Return the patches with the loss that their residuals call for; it never widens.
+
+        Args:
+            T_map_camera: (N, 4, 4), where the surfaces were fitted.
+            workers: the threads.
+            sigma: standard deviation of the points' noise, m, which keeps the scale from vanishing.
+        """
+        if not len(self):
+            return Fit(self, 0.0)
+        squares = np.square(self._off(T_map_camera, workers))
+        scale = self.robust * max(1.4826 * float(np.sqrt(np.median(squares))), LEAST * sigma)
+        scale = min(scale, self.scale or scale)
+        cost = scale**2 * float((squares / (scale**2 + squares)).sum())
+        cost += float((self.stiff[:, None] * self.surface[:, 3:] ** 2).sum())
+        return Fit(replace(self, scale=scale), cost)
+
+    def normal_equations(
+        self, T_map_camera: Array, pivots: Array, workers: Workers
+    ) -> tuple[Array, Array]:
+        """Return the matrix (6N, 6N) and gradient (N, 6) in perturbations about the pivots (N, 3).
+
+        The surfaces, fitted at these poses or near them, are eliminated.
+        """
+        n = self.frames
+        Q, o = self._local(T_map_camera)
+        pivot = self._in_patches(pivots)
+
+        def of(share: tuple[int, int]) -> tuple[Array, Array]:
+            A, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+            patch_kernels.gather(
+                *share, self.points, self.weights, self.ends, self.views, self.frame, Q, o, pivot,
+                self.axes, self.reach, self.stiff, self.rays, self.surface, self.scale**2, A, g,
+            )  # fmt: skip
+            return A, g
+
+        A, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+        for more, pull in workers.map(of, self._shares()):
+            A += more
+            g += pull
+        return A.reshape(6 * n, 6 * n), g
+
+    def scores(
+        self, T_map_camera: Array, pivots: Array, groups: list[NDArray[np.uint8]], count: int,
+        workers: Workers,
+    ) -> Array:  # fmt: skip
+        """Return the reduced gradient of each group of points, (kinds, count, 6N).
+
+        ``groups`` says for each frame, (kinds, points of the frame), which group a point is in.
+        """
+        n, kinds = self.frames, len(groups[0])
+        Q, o = self._local(T_map_camera)
+        pivot, mine = self._in_patches(pivots), np.empty((len(self.points), kinds), np.uint8)
+        for m, (first, last) in enumerate(pairwise(self.ends)):
+            mine[first:last] = groups[self.frame[m]][:, self.source[first:last]].T
+
+        def of(share: tuple[int, int]) -> Array:
+            out = np.zeros((kinds, count, n, 6))
+            patch_kernels.scores(
+                *share, self.points, self.weights, self.ends, self.views, self.frame, Q, o, pivot,
+                self.axes, self.reach, self.stiff, self.rays, self.surface, self.scale**2, mine,
+                out,
+            )  # fmt: skip
+            return out
+
+        total = sum(workers.map(of, self._shares()), start=np.zeros((kinds, count, n, 6)))
+        return np.asarray(total.reshape(kinds, count, 6 * n))
+
+    def _off(self, T: Array, workers: Workers) -> Array:
+        """Return (n,) how far every point lies off its surface, m at a point of typical noise."""
+        off = np.empty(len(self.points))
+        Q, o = self._local(T)
+
+        def of(share: tuple[int, int]) -> None:
+            patch_kernels.residuals(
+                *share, self.points, self.weights, self.ends, self.views, Q, o, self.reach,
+                self.rays, self.surface, off,
+            )  # fmt: skip
+
+        workers.map(of, self._shares())
+        return off
+
+    def _local(self, T: Array) -> tuple[Array, Array]:
+        """Return Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
+        patch = np.repeat(np.arange(len(self)), np.diff(self.views))
+        V, R = self.axes[patch].transpose(0, 2, 1), T[self.frame, :3, :3]
+        away = T[self.frame, :3, 3] - self.centre[patch]
+        return np.ascontiguousarray(V @ R), np.ascontiguousarray((V @ away[..., None])[..., 0])
+
+    def _in_patches(self, pivots: Array) -> Array:
+        """Return (m, 3) the pivot of each view's frame in the axes of its patch."""
+        patch = np.repeat(np.arange(len(self)), np.diff(self.views))
+        away = pivots[self.frame] - self.centre[patch]
+        return np.ascontiguousarray(np.einsum("mji,mj->mi", self.axes[patch], away))
+
+    def _shares(self) -> list[tuple[int, int]]:
+        """Deal the patches out in runs, as many whatever the number of threads."""
+        ends = np.linspace(0, len(self), SHARES + 1).astype(int).tolist()
+        return [(a, b) for a, b in pairwise(ends) if a < b]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Patches whose surfaces were fitted at some poses."""
+
+    patches: Patches
+    cost: float
+    """Robust sum of squared distances from the surfaces, m^2."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of all frames, some of which may lie on patches."""
+
+    points: Array
+    """(n, 3), sensor frame, m."""
+    weights: Array
+    """(n,), inverse variance relative to the typical one."""
+    frame: Ints
+    """(n,)."""
+    source: Ints
+    """(n,), index of each point among those of its frame."""
+    rays: bool
+    """Whether points lie on rays from the origin of their sensor."""
+
+    @staticmethod
+    def of(problem: Problem, taken: list[NDArray[np.bool_]] | None = None) -> Cloud:
+        """Return all points of a problem, or those that ``taken`` says of each frame."""
+        each = [
+            np.arange(len(f)) if taken is None else np.flatnonzero(taken[i])
+            for i, f in enumerate(problem.frames)
+        ]
+        parts = [f.points[k] for f, k in zip(problem.frames, each, strict=True)]
+        return Cloud(
+            np.concatenate([p[:, :3] for p in parts]).astype(np.float64),
+            np.concatenate([p[:, 3] for p in parts]).astype(np.float64) ** 2,
+            np.repeat(np.arange(len(each)), [len(k) for k in each]),
+            np.concatenate(each),
+            problem.origin,
+        )
+
+
+def lay(
+    cloud: Cloud, T_map_camera: Array, sides: tuple[float, ...], robust: float, sigma: float,
+    workers: Workers,
+) -> Fit:  # fmt: skip
+    """Lay patches over points, in voxels of the first side; where there is none, of the next.
+
+    Args:
+        cloud: the points.
+        T_map_camera: (N, 4, 4), where to lay them.
+        sides: of the voxels, m, descending.
+        robust: scale of the loss, in robust standard deviations of the residuals.
+        sigma: standard deviation of the points' noise, m.
+        workers: the threads.
+    """
+    n = len(T_map_camera)
+    x = np.einsum("nij,nj->ni", T_map_camera[cloud.frame, :3, :3], cloud.points)
+    x += T_map_camera[cloud.frame, :3, 3]
+    left = np.arange(len(x))
+    patch: Ints = np.full(len(x), -1)
+    axes, centre, size, total = [], [], [], 0
+    for side in sides:
+        if not len(left):
+            break
+        of, V, c = _voxels(x[left], cloud.weights[left], cloud.frame[left], n, side)
+        on = of >= 0
+        patch[left[on]] = total + of[on]
+        left = left[~on]
+        total += len(c)
+        axes.append(V)
+        centre.append(c)
+        size.append(np.full(len(c), side))
+    each = np.concatenate(size) if size else np.empty(0)
+    found = np.flatnonzero(patch >= 0)
+    order = found[np.lexsort((cloud.frame[found], patch[found]))]
+    key = patch[order] * n + cloud.frame[order]
+    new = np.concatenate([[True], key[1:] != key[:-1]])
+    begins = np.flatnonzero(new[: len(key)])
+    seen = patch[order][begins] if len(order) else np.empty(0, np.int64)
+    laid = Patches(
+        points=np.ascontiguousarray(cloud.points[order]),
+        weights=cloud.weights[order],
+        source=cloud.source[order],
+        ends=np.concatenate([begins, [len(order)]]).astype(np.int64),
+        frame=cloud.frame[order][begins],
+        views=np.concatenate([[0], np.cumsum(np.bincount(seen, minlength=total))]).astype(np.int64),
+        axes=np.ascontiguousarray(np.concatenate(axes)) if axes else np.empty((0, 3, 3)),
+        centre=np.concatenate(centre) if centre else np.empty((0, 3)),
+        reach=REACH * each,
+        stiff=(sigma * each) ** 2,
+        surface=np.zeros((total, patch_kernels.TERMS)),
+        robust=robust,
+        scale=0.0,
+        rays=cloud.rays,
+        frames=n,
+    )
+    fit = Fit(laid, 0.0)
+    for _ in range(AFRESH):
+        fit = fit.patches.fitted(T_map_camera, workers, 1)
+        fit = fit.patches.rescaled(T_map_camera, workers, sigma)
+    return fit
+
+
+def _voxels(
+    x: Array, weights: Array, frame: Ints, frames: int, side: float
+) -> tuple[Ints, Array, Array]:
+    """Find patches in voxels of the given side, m.
+
+    Returns:
+        (n,) the patch of each point, -1 for none; axes (k, 3, 3) and centres (k, 3).
+    """
+    cell = np.floor(x / side).astype(np.int64)
+    cell -= cell.min(axis=0)
+    spans = cell.max(axis=0) + 1
+    key = ((cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]) * frames + frame
+    order = np.argsort(key, kind="stable")
+    sorted_key = key[order]
+    first = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
+    view = np.cumsum(first) - 1
+    where = sorted_key[first] // frames
+    voxel = np.cumsum(np.concatenate([[True], where[1:] != where[:-1]])) - 1
+    m, k = len(where), int(voxel[-1]) + 1
+    count, weight = np.zeros(m, np.int64), np.zeros(m)
+    mean, spread = np.zeros((m, 3)), np.zeros((m, 3, 3))
+    patch_kernels.moments(order, view, x, weights, count, weight, mean, spread)
+    many = count >= FEWEST
+    on = voxel[many]
+    pooled = np.zeros((k, 3, 3))
+    np.add.at(pooled, on, spread[many])
+    total = np.bincount(on, weight[many], k)
+    values, axes = np.linalg.eigh(pooled)
+    good = (
+        (np.bincount(on, minlength=k) >= SEVERAL)
+        & (values[:, 1] > FLAT**2 * values[:, 0])
+        & (values[:, 1] > total * (WIDE * side) ** 2)
+    )
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    moment = [np.bincount(on, weight[many] * mean[many, a], k) for a in range(3)]
+    centre = np.stack(moment, axis=1) / np.maximum(total, 1e-300)[:, None]
+    patch: Ints = np.full(len(x), -1)
+    patch[order] = np.where((good[voxel] & many)[view], (np.cumsum(good) - 1)[voxel][view], -1)
+    return patch, axes[good], centre[good]

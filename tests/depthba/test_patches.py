@@ -1,0 +1,173 @@
+"""Quadric patches: their normal equations, what groups of points say, recovery of steep scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from depthba import se3
+from depthba.optimiser.patches import Cloud, Patches, lay
+from depthba.optimiser.prior import move
+from depthba.optimiser.workers import Workers
+
+N = 4
+
+
+@pytest.fixture(scope="module")
+def workers():
+    made = Workers(2)
+    yield made
+    made.close()
+
+
+def poses(rng, t=0.0, r=0.0):
+    """Sensors about 1 m above the scene, off by Gaussian errors; frame 0 is exact."""
+    T = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])[None].repeat(N, axis=0)
+    T[:, :2, 3] = [[-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]]
+    error = np.concatenate([rng.normal(0, t, (N, 3)), rng.normal(0, r, (N, 3))], axis=1)
+    error[0] = 0.0
+    return move(T, T[:, :3, 3], error)
+
+
+def balls(rng, T, sigma, points=2500, flat=0.0):
+    """Noisy points on half balls that stand close together, as each frame sees them.
+
+    The larger `flat`, the less of a ball.
+    """
+    centres = np.stack([*np.meshgrid([-0.12, 0.0, 0.12], [-0.12, 0.0, 0.12]), np.zeros((3, 3))], -1)
+    clouds = []
+    for pose in T:
+        k = rng.integers(0, 9, points)
+        d = rng.normal(size=(points, 3))
+        d[:, 2] = np.abs(d[:, 2]) + flat
+        x = centres.reshape(-1, 3)[k] + 0.05 * d / np.linalg.norm(d, axis=1)[:, None]
+        p = (x - pose[:3, 3]) @ pose[:3, :3]
+        way = np.linalg.norm(p, axis=1)
+        clouds.append(p * (1 + sigma * rng.normal(size=points) / way)[:, None])
+    frame = np.repeat(np.arange(N), points)
+    return Cloud(
+        np.concatenate(clouds), np.ones(N * points), frame, np.tile(np.arange(points), N), True
+    )
+
+
+@pytest.fixture(scope="module")
+def laid(workers):
+    rng = np.random.default_rng(3)
+    T = poses(rng)
+    fit = lay(balls(rng, T, 3e-4, flat=1.5), T, (0.06, 0.03), 10.0, 3e-4, workers)
+    return T, fit.patches
+
+
+def settled(patches: Patches, T, workers, rounds=60):
+    return patches.fitted(T, workers, rounds)
+
+
+@pytest.mark.parametrize("rays", [True, False])
+def test_the_gradient_is_that_of_the_cost_with_the_surfaces_settled(laid, workers, rays):
+    T, patches = laid
+    # where surfaces are settled, what they cost changes with the poses alone
+    patches = replace(patches, rays=rays, scale=1.0)
+    rng = np.random.default_rng(5)
+    T = move(T, T[:, :3, 3], 1e-4 * rng.normal(size=(N, 6)))
+    pivots = T[:, :3, 3] + rng.normal(0, 0.2, (N, 3))
+    there = settled(patches, T, workers).patches
+    _, g = there.normal_equations(T, pivots, workers)
+    found, step = np.empty((N, 6)), 1e-6
+    for i, k in np.ndindex(N, 6):
+        d = np.zeros((N, 6))
+        d[i, k] = step
+        costs = [settled(there, move(T, pivots, s * d), workers).cost for s in (1, -1)]
+        found[i, k] = (costs[0] - costs[1]) / (2 * step)
+    # 2 g is the derivative of a sum of squares, but for how weights change with the normal
+    scale = np.abs(2 * g).max()
+    np.testing.assert_allclose(2 * g, found, atol=1e-2 * scale)
+
+
+def test_the_matrix_is_the_second_derivative_where_residuals_are_small(workers):
+    rng = np.random.default_rng(1)
+    T = poses(rng)
+    patches = lay(balls(rng, T, 1e-6), T, (0.03,), 10.0, 1e-6, workers).patches
+    patches = replace(patches, rays=False, scale=1.0)
+    there = settled(patches, T, workers)
+    A, g = there.patches.normal_equations(T, T[:, :3, 3], workers)
+    d = 2e-4 * rng.normal(size=(N, 6))
+    after = settled(there.patches, move(T, T[:, :3, 3], d), workers).cost
+    expected = there.cost + 2 * float((g * d).sum()) + float(d.ravel() @ A @ d.ravel())
+    assert after == pytest.approx(expected, rel=0.05)
+
+
+def test_all_frames_moved_as_one_cost_the_same(laid, workers):
+    T, patches = laid
+    A, _ = patches.normal_equations(T, np.zeros((N, 3)), workers)
+    # surfaces follow a shift along, and to first order a turn of, the whole scene
+    as_one = np.tile(np.eye(6), (N, 1))
+    shared = np.abs(as_one.T @ A @ as_one)
+    own = sum(np.abs(A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]) for i in range(N))
+    assert (shared[:2, :2] < 0.2 * own[:2, :2].max()).all()
+    assert np.linalg.eigvalsh(A)[0] > -1e-9 * np.linalg.eigvalsh(A)[-1]
+
+
+def test_groups_of_points_add_up_to_the_gradient(laid, workers):
+    T, patches = laid
+    T = move(T, T[:, :3, 3], 1e-4 * np.ones((N, 6)))
+    pivots = T[:, :3, 3]
+    there = settled(patches, T, workers).patches
+    _, g = there.normal_equations(T, pivots, workers)
+    rng = np.random.default_rng(2)
+    groups = [rng.integers(0, 5, (2, 2500)).astype(np.uint8) for _ in range(N)]
+    scores = there.scores(T, pivots, groups, 5, workers)
+    assert scores.shape == (2, 5, 6 * N)
+    # what is left of the surfaces' own gradient, and their stiffness, are not the points'
+    np.testing.assert_allclose(
+        scores.sum(axis=1), np.tile(g.ravel(), (2, 1)), atol=1e-3 * np.abs(g).max()
+    )
+
+
+def test_one_and_two_threads_say_the_same(laid, workers):
+    T, patches = laid
+    alone = Workers(1)
+    for one, two in zip(
+        patches.normal_equations(T, T[:, :3, 3], alone),
+        patches.normal_equations(T, T[:, :3, 3], workers),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_balls_on_nothing_bring_the_frames_together(workers):
+    from depthba.optimiser.tying import FAR
+
+    rng = np.random.default_rng(11)
+    T_true = poses(rng)
+    cloud = balls(rng, T_true, 3e-4)
+    T = move(T_true, T_true[:, :3, 3], 4e-3 * rng.normal(size=(N, 6)) * (np.arange(N) > 0)[:, None])
+    began = np.abs(T - T_true).max()
+    for _ in range(6):
+        fit = lay(replace(cloud, rays=False), T, (0.03,), FAR.robust, 3e-4, workers)
+        for _ in range(4):
+            pivots = np.zeros((N, 3))
+            A, g = fit.patches.normal_equations(T, pivots, workers)
+            step = np.zeros(6 * N)
+            step[6:] = -np.linalg.solve(A[6:, 6:], g.ravel()[6:])
+            T = move(T, pivots, step.reshape(N, 6))
+            fit = fit.patches.fitted(T, workers)
+    assert began > 5e-3
+    assert np.abs(T[:, :3] - T_true[:, :3]).max() < 2e-4
+
+
+def test_a_voxel_that_one_frame_sees_is_no_patch(workers):
+    rng = np.random.default_rng(0)
+    T = poses(rng)
+    cloud = balls(rng, T, 1e-4)
+    alone = cloud.frame == 1
+    one = Cloud(
+        cloud.points[alone], cloud.weights[alone], cloud.frame[alone], cloud.source[alone], True
+    )
+    fit = lay(one, T, (0.06, 0.03), 3.5, 1e-4, workers)
+    assert len(fit.patches) == 0
+    assert fit.cost == 0.0
+    A, g = fit.patches.normal_equations(T, T[:, :3, 3], workers)
+    assert not A.any()
+    assert not g.any()
