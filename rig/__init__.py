@@ -1,1 +1,1 @@
-"""The real capture rig: arm, axes, cameras and capture sessions. Nothing of it is written yet."""
+"""The real capture rig: arm, axes, cameras and hand-eye calibration."""
