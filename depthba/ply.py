@@ -47,7 +47,9 @@ def read_ply_points(path: str | Path) -> NDArray[np.float32]:
 
 
 def parse_ply_points(
-    data: bytes, name: str, dtype: type[Real] = np.float32  # type: ignore[assignment]
+    data: bytes,
+    name: str,
+    dtype: type[Real] = np.float32,  # type: ignore[assignment]
 ) -> NDArray[Real]:
     """Read the points (n, 3) from a binary PLY file's bytes; ``name`` is for the `DatasetError`."""
     order, elements, start = _parse_header(data, name)

@@ -1,4 +1,4 @@
-"""Finding and loading the files of a source. `DatasetError` names the file and what was expected."""
+"""Finding and loading the files of a source. `DatasetError` names the file and the fault."""
 
 from __future__ import annotations
 
@@ -34,9 +34,7 @@ def listed(folder: Path, suffixes: Sequence[str], pattern: str = "*") -> list[Pa
     """Return the files of a folder with one of the suffixes, in order; none where it is absent."""
     if not folder.is_dir():
         return []
-    return in_order(
-        p for p in folder.glob(pattern) if p.suffix.lower() in suffixes and p.is_file()
-    )
+    return in_order(p for p in folder.glob(pattern) if p.suffix.lower() in suffixes and p.is_file())
 
 
 def text(path: Path) -> str:

@@ -65,9 +65,7 @@ def by_order(names: Sequence[str], poses: Poses) -> Paired:
     return [(k, float(stamps[k]), poses.poses[k]) for k in range(len(names))]
 
 
-def by_name(
-    found: Sequence[Path], poses: Poses, max_gap: float
-) -> tuple[Paired, tuple[str, ...]]:
+def by_name(found: Sequence[Path], poses: Poses, max_gap: float) -> tuple[Paired, tuple[str, ...]]:
     """Give every file its pose: by the stamp that is its name, else by its place.
 
     A name is a stamp where most names, in s, ms, µs or ns, lie among the stamps of the poses.

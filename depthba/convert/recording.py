@@ -92,7 +92,7 @@ class Recording:
     path: Path
     format: str
     frames: tuple[SourceFrame, ...]
-    convention: Convention = Convention()  # noqa: RUF009, it is frozen
+    convention: Convention = Convention()
     depth_scale: float | None = None
     """Metres per step of the depth images; None: they are not integers, or there are none."""
     model: str = ""

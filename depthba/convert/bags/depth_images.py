@@ -101,9 +101,7 @@ def _either(message: Any, *names: str) -> Any:
     return next(getattr(message, name) for name in names if hasattr(message, name))
 
 
-def _pixels(
-    message: Any, dtype: np.dtype[Any], channels: int, name: str
-) -> NDArray[Any]:
+def _pixels(message: Any, dtype: np.dtype[Any], channels: int, name: str) -> NDArray[Any]:
     """Return (height, width, channels): rows may be padded."""
     data = np.asarray(message.data, dtype=np.uint8)
     width = message.width * channels * dtype.itemsize

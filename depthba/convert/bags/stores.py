@@ -117,7 +117,9 @@ class _Mcap:
                 return self._types.deserialize_ros1(message.data, kind)
             return self._types.deserialize_cdr(message.data, kind)
         except Exception as error:  # cut off, or not of that type
-            raise DatasetError(f"{self._path}: {channel.topic}: {error!r}, expected {kind}") from error
+            raise DatasetError(
+                f"{self._path}: {channel.topic}: {error!r}, expected {kind}"
+            ) from error
 
     def __del__(self) -> None:
         if hasattr(self, "_file"):

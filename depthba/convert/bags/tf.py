@@ -84,9 +84,7 @@ class Tree:
         T: Array = np.eye(4)
         for child in chain:
             edge = self._edges[child]
-            link = (
-                edge.T_parent_child[-1] if edge.fixed else self._poses[child].at(stamp, max_gap)
-            )
+            link = edge.T_parent_child[-1] if edge.fixed else self._poses[child].at(stamp, max_gap)
             if link is None:
                 return None
             T = link @ T

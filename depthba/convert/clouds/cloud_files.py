@@ -42,7 +42,7 @@ def write(
     colours: NDArray[np.uint8] | None = None,
     T_world_sensor: Array | None = None,
 ) -> None:
-    """Write points (n, 3), m, and colours (n, 3) uint8 RGB; a pose goes where the format has one."""
+    """Write points (n, 3), m, and colours (n, 3) uint8 RGB; the pose where a file has one."""
     suffix = path.suffix.lower()
     if suffix == ".ply":
         ply.write_ply(path, points, colours)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 def poses(path: Path) -> Array:
     """Return T_world_scan (N, 4, 4) of the scans in a file; the identity where one has no pose."""
-    with _opened(path) as file:
+    with _Opened(path) as file:
         out = np.tile(np.eye(4), (file.scan_count, 1, 1))
         for k in range(file.scan_count):
             header = file.get_header(k)
@@ -31,7 +31,7 @@ def poses(path: Path) -> Array:
 
 def read(path: Path, scan: int) -> Array:
     """Return the points (n, 3), m, of one scan, in its own frame."""
-    with _opened(path) as file:
+    with _Opened(path) as file:
         try:
             data = file.read_scan(scan, transform=False, ignore_missing_fields=True)
         except Exception as error:  # its exceptions have no class of their own
@@ -52,7 +52,7 @@ def write(path: Path, scans: Sequence[tuple[Array, Array]]) -> None:
             )
 
 
-class _opened:
+class _Opened:
     """An E57 file for reading; what the library throws becomes a known error."""
 
     def __init__(self, path: Path) -> None:

@@ -35,7 +35,7 @@ def parse(data: bytes, name: str) -> Pcd:
         sizes = [int(v) for v in header["SIZE"]]
         counts = [int(v) for v in header.get("COUNT", ["1"] * len(fields))]
         number = int(header["POINTS"][0])
-        view = [float(v) for v in header.get("VIEWPOINT", "0 0 0 1 0 0 0".split())]
+        view = [float(v) for v in header.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])]
         dtype = np.dtype(
             [
                 (f"{field}{k}" if field == "_" else field, f"<{_KINDS[kind]}{size}", (count,))

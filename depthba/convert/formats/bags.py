@@ -33,9 +33,7 @@ def recognise(path: Path) -> str:
     """Tell what speaks for the format."""
     if path.is_file():
         return path.name if path.suffix in _SUFFIXES else ""
-    if (path / "metadata.yaml").is_file() and any(
-        p.suffix in _SUFFIXES for p in path.iterdir()
-    ):
+    if (path / "metadata.yaml").is_file() and any(p.suffix in _SUFFIXES for p in path.iterdir()):
         return "metadata.yaml of a ROS 2 bag"
     return ""
 
@@ -192,9 +190,7 @@ def _colours(
     return found
 
 
-def _colour_at(
-    store: stores.Store, colours: list[tuple[float, str, int]], stamp: float
-) -> Any:
+def _colour_at(store: stores.Store, colours: list[tuple[float, str, int]], stamp: float) -> Any:
     near = min(colours, key=lambda row: abs(row[0] - stamp), default=None)
     if near is None or abs(near[0] - stamp) > _ALIGNED:
         return None

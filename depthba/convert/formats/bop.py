@@ -45,11 +45,15 @@ def read(path: Path, reading: Reading) -> Recording:
     scales = set()
     for key in order:
         entry, where = value[key], f"{file}: image {key}"
-        found = [p for s in (".png", ".tif") if (p := path / "depth" / f"{int(key):06d}{s}").exists()]
+        found = [
+            p for s in (".png", ".tif") if (p := path / "depth" / f"{int(key):06d}{s}").exists()
+        ]
         if not found:
             without.append(key)
             continue
-        steps = reading.depth_scale or MILLIMETRE * float(_numbers(entry, "depth_scale", 1, where)[0])
+        steps = reading.depth_scale or MILLIMETRE * float(
+            _numbers(entry, "depth_scale", 1, where)[0]
+        )
         scales.add(steps)
         frames.append(
             SourceFrame(
@@ -78,7 +82,9 @@ def write(dataset: Dataset, T_world_camera: Array, path: Path) -> None:
     """Write one scene, depth at the dataset's own scale."""
     camera = camera_of(dataset, "BOP")
     if any(camera.distortion):
-        raise DatasetError(f"{dataset.path}: lens distortion, which BOP cannot say: undistort first")
+        raise DatasetError(
+            f"{dataset.path}: lens distortion, which BOP cannot say: undistort first"
+        )
     colour = any("rgb" in frame.files for frame in dataset)
     new_folder(path, "depth", *(("rgb",) if colour else ()))
     scale = dataset.sensor.depth_scale or MILLIMETRE

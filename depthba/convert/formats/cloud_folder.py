@@ -99,7 +99,7 @@ def _poses_in(path: Path) -> Path:
 
 
 def _e57(root: Path, found: list[Path], unit: float) -> Recording:
-    frames = []
+    frames: list[SourceFrame] = []
     for file in found:
         for k, T in enumerate(e57.poses(file)):
             frames.append(
@@ -116,7 +116,7 @@ def _e57(root: Path, found: list[Path], unit: float) -> Recording:
 def _in_one_frame(
     root: Path, found: list[Path], clouds: list[partial[Array]], unit: float
 ) -> Recording:
-    """Put the frames at a place near the points: single precision would not hold a grid's metres."""
+    """Put the frames near the points: single precision does not hold a national grid's metres."""
     first = clouds[0]()
     near = np.rint(first.mean(axis=0)) if len(first) else np.zeros(3)
     T = se3.make(np.eye(3), near)

@@ -159,7 +159,8 @@ def _camera(
     model = values.get("camera_model", "OPENCV")
     if model not in _MODELS and reading.intrinsics is None:
         raise DatasetError(
-            f"{where}: camera_model {model!r}, expected one of {', '.join(_MODELS)}: undistort first"
+            f"{where}: camera_model {model!r}, expected one of {', '.join(_MODELS)}: "
+            "undistort the images first"
         )
     try:
         told = [float(values.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3")]
@@ -177,7 +178,10 @@ def _camera(
         raise DatasetError(f"{where}: k4 is {values['k4']}, expected five coefficients at most")
     key = (*lens, *told)
     if key not in known or size is not None:
-        width, height = size or (next(iter(known.values())).width, next(iter(known.values())).height)
+        width, height = size or (
+            next(iter(known.values())).width,
+            next(iter(known.values())).height,
+        )
         for name, found in (("w", width), ("h", height)):
             if name in values and int(values[name]) != found:
                 raise DatasetError(

@@ -96,10 +96,10 @@ def _places(log: Path, expected: int) -> list[int]:
     except ValueError:
         raise DatasetError(f"{log}: a line of 3 that are not integers") from None
     if len(places) != expected or len(set(places)) != expected or min(places) < 0:
-        raise DatasetError(f"{log}: {expected} matrices with {len(places)} heads, expected one each")
+        raise DatasetError(
+            f"{log}: {expected} matrices with {len(places)} heads, expected one each"
+        )
     return places
 
 
-FORMAT = Format(
-    "redwood", "Redwood, Open3D: depth/, color/, odometry.log", recognise, read, write
-)
+FORMAT = Format("redwood", "Redwood, Open3D: depth/, color/, odometry.log", recognise, read, write)
