@@ -58,10 +58,9 @@ class Options:
 def options_of(config: Mapping[str, Any]) -> Options:
     """Return the options that a run saved; those that this version does not know are left out."""
     known = {field.name for field in fields(Options)}
-    return Options(
-        **{
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in config.items()
-            if key in known
-        }
-    )
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in config.items()
+        if key in known
+    }
+    return Options(**values)

@@ -106,7 +106,8 @@ def into_dataset(
         rgb = None
         if depth is not None and as_clouds:
             assert frame.camera is not None
-            depth, cloud = None, frame.camera.backproject(depth)
+            cloud = frame.camera.backproject(depth)
+            depth = None
         elif depth is not None and frame.rgb is not None:
             rgb = frame.rgb()
             if rgb.shape[:2] != depth.shape:

@@ -1,7 +1,8 @@
 """Whether frames overlap under the convention of their poses; and if not, under which other.
 
-A wrong convention is no fault that a file shows: it puts frames apart that saw the same ground. So a few pairs of frames are laid on one another, and where the points of the one find
-hardly any of the other, the other conventions are tried.
+A wrong convention is no fault that a file shows: it puts frames apart that saw the same ground. So
+a few pairs of frames are laid on one another, and where the points of the one find hardly any of
+the other, the other conventions are tried.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ FIXED_POINTS, MOVED_POINTS = 20_000, 1500
 """Points of the one frame, and of the other, at most."""
 TURN, SHIFT = 0.2, 0.25
 """A pair has moved enough when it has turned by that, rad, or shifted by that part of the range."""
-TOLERANCE = 0.01
+TOLERANCE = 0.02
 """Of the range: points that near are the same."""
 FACTORS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
 """Between the units of poses and of depth that people mix up."""
@@ -35,6 +36,8 @@ LEAST_SHIFT = 0.01
 GOOD, BETTER = 0.3, 0.2
 """Another convention explains the frames when that part of the points agrees, and it is that much
 more, and at least twice as many."""
+AS_GOOD = 0.8
+"""With that part of the declared convention's share, another is as good."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class Verdict:
     best: Convention
     """The one that explains the frames."""
     best_share: float
+    as_good: tuple[Convention, ...] = ()
+    """Others that the overlap cannot tell from the declared one."""
 
 
 def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
@@ -71,6 +76,9 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
             f"{notes[0]}, which is little, but no other convention does better: "
             "are the poses those of these frames?",
         )
+    if verdict.as_good:
+        others = ", or ".join(map(str, verdict.as_good))
+        notes = (f"{notes[0]}; the overlap cannot tell that from {others}",)
     return verdict, notes
 
 
@@ -81,19 +89,19 @@ def judge(recording: Recording) -> Verdict:
     if not pairs:
         return Verdict(float("nan"), declared, float("nan"))
     share = _share(pairs, recording.poses, declared)
-    best, best_share = declared, share
-    if share < 0.5:  # no other could agree in twice as many
-        same_scale = list(_others(declared, (1.0,)))
-        for candidates in (same_scale, list(_others(declared, FACTORS))):
-            for other in candidates:
-                if other.scale != declared.scale and not _moves(pairs, recording.poses, other):
-                    continue
-                found = _share(pairs, recording.poses, other)
-                if found > max(best_share, GOOD, share + BETTER, 2 * share):
-                    best, best_share = other, found
-            if best != declared:
-                break
-    return Verdict(share, best, best_share)
+    least = max(GOOD, share + BETTER, 2 * share)
+    others = {c: _share(pairs, recording.poses, c) for c in _others(declared, (1.0,))}
+    as_good = tuple(c for c, found in others.items() if found >= AS_GOOD * share > 0.1)
+    if share < 0.5 and max(others.values()) <= least:  # above, none could agree in twice as many
+        others = {
+            c: _share(pairs, recording.poses, c)
+            for c in _others(declared, FACTORS)
+            if _moves(pairs, recording.poses, c)
+        }
+    best = max(others, key=lambda c: others[c], default=declared)
+    if best == declared or others[best] <= least:
+        return Verdict(share, declared, share, as_good)
+    return Verdict(share, best, others[best])
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,38 +123,42 @@ def _pairs(recording: Recording) -> Iterator[_Pair]:
     from scipy.spatial import cKDTree
 
     poses = recording.T_world_camera
-    last = len(poses) - 1
-    for i in sorted({round(k) for k in np.linspace(0, max(last - 1, 0), PAIRS)}):
-        if i >= last:
-            continue
+    if len(poses) < 2:
+        return
+    for i in sorted({round(k) for k in np.linspace(0, len(poses) - 1, PAIRS)}):
         fixed = _points(recording, i, FIXED_POINTS)
         if len(fixed) < 100:
             continue
         reach = float(np.median(np.linalg.norm(fixed, axis=1)))
-        between = se3.inverse(poses[i]) @ poses[i + 1 :]
-        turned = np.linalg.norm(se3.log_so3(between[:, :3, :3]), axis=1) / TURN
-        shifted = np.linalg.norm(between[:, :3, 3], axis=1) / (SHIFT * reach)
-        moved = np.maximum(turned, np.minimum(shifted, 2.0))
-        enough = np.nonzero(moved >= 1)[0]
-        j = i + 1 + int(enough[0] if len(enough) else np.argmax(moved))
-        points = _points(recording, j, MOVED_POINTS)
-        if len(points) < 100:
-            continue
         tree = cKDTree(fixed)
         spacing = float(np.median(tree.query(fixed[:: max(1, len(fixed) // 500)], k=2)[0][:, 1]))
-        yield _Pair(i, j, tree, points, max(2 * spacing, TOLERANCE * reach), reach)
+        # which are neighbours depends on which way the poses map: those of either way are tried
+        for j in sorted({_neighbour(T, i, reach) for T in (poses, se3.inverse(poses))}):
+            points = _points(recording, j, MOVED_POINTS)
+            if len(points) >= 100:
+                yield _Pair(i, j, tree, points, max(2 * spacing, TOLERANCE * reach), reach)
+
+
+def _neighbour(poses: Array, i: int, reach: float) -> int:
+    """Return the nearest of the frames that have moved enough: it sees most of the same ground."""
+    between = se3.inverse(poses[i]) @ poses
+    turned = np.linalg.norm(se3.log_so3(between[:, :3, :3]), axis=1) / TURN
+    shifted = np.linalg.norm(between[:, :3, 3], axis=1) / (SHIFT * reach)
+    moved = np.maximum(turned, shifted)
+    enough = np.nonzero(moved >= 1)[0]
+    return int(enough[np.argmin(moved[enough])] if len(enough) else np.argmax(moved))
 
 
 def _share(pairs: list[_Pair], poses: Array, convention: Convention) -> float:
-    """Return the part of the points that agree, mean over the pairs."""
-    shares = []
+    """Return the part of the points that agree: the better of a frame's neighbours, their mean."""
+    shares: dict[int, float] = {}
     for pair in pairs:
         T_i, T_j = convention.applied(poses[[pair.i, pair.j]])
         T = se3.inverse(T_i) @ T_j
         p = pair.moved @ T[:3, :3].T + T[:3, 3]
         found = pair.tree.query(p, distance_upper_bound=pair.tolerance)[0]  # type: ignore[attr-defined]
-        shares.append(float(np.isfinite(found).mean()))
-    return float(np.mean(shares))
+        shares[pair.i] = max(shares.get(pair.i, 0.0), float(np.isfinite(found).mean()))
+    return float(np.mean(list(shares.values())))
 
 
 def _moves(pairs: list[_Pair], poses: Array, convention: Convention) -> bool:

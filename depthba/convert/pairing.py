@@ -19,6 +19,8 @@ Paired = list[tuple[int, float, Array]]
 
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Seconds per unit of stamps in names of files."""
+_STAMP_DIGITS = 10
+"""Seconds since 1970 have as many."""
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
@@ -68,7 +70,8 @@ def by_order(names: Sequence[str], poses: Poses) -> Paired:
 def by_name(found: Sequence[Path], poses: Poses, max_gap: float) -> tuple[Paired, tuple[str, ...]]:
     """Give every file its pose: by the stamp that is its name, else by its place.
 
-    A name is a stamp where most names, in s, ms, µs or ns, lie among the stamps of the poses.
+    A name is a stamp where it has a point or ten digits, and most, in s, ms, µs or ns, lie among
+    the stamps of the poses; or where all are stamps of poses to the letter.
     """
     names = [p.name for p in found]
     if poses.stamps is None:
@@ -81,15 +84,20 @@ def by_name(found: Sequence[Path], poses: Poses, max_gap: float) -> tuple[Paired
         span = poses.stamps.min() - max_gap, poses.stamps.max() + max_gap
         share = float(((known >= span[0]) & (known <= span[1])).mean())
         exact = np.isin(np.rint(known * 1e6), np.rint(poses.stamps * 1e6)).mean()
-        # 000000.png to 000099.png lie within many a span: to count, whole numbers must be met
-        whole = unit == 1.0 and bool((known == np.rint(known)).all())
-        if (exact > 0.5 or not whole) and share > 0.5:
+        # 000000.png to 000099.png lie within many a span
+        telling = all(len(_digits(p)) >= _STAMP_DIGITS or "." in _digits(p) for p in found)
+        if (telling and share > 0.5) or (unit == 1.0 and exact == 1.0):
             return by_stamp(names, known, poses, max_gap)
     return by_order(names, poses), ("poses belong to the frames in their order",)
 
 
+def _digits(path: Path) -> str:
+    """Return the last number in a name."""
+    found = _NUMBER.findall(path.name[: -len(path.suffix)] if path.suffix else path.name)
+    return str(found[-1]) if found else ""
+
+
 def _stamp(path: Path, unit: float) -> float | None:
     """Return the last number in a name, s."""
-    name = path.name[: -len(path.suffix)] if path.suffix else path.name
-    found = _NUMBER.findall(name)
-    return float(found[-1]) * unit if found else None
+    digits = _digits(path)
+    return float(digits) * unit if digits else None

@@ -85,7 +85,9 @@ def looks_like_tum(path: Path) -> bool:
         rows = _rows(path, limit=1)
     except DatasetError:
         return False
-    return len(rows) == 1 and len(rows[0][1]) == 8 and abs(np.linalg.norm(rows[0][1][4:]) - 1) < 0.1
+    if len(rows) != 1 or len(rows[0][1]) != 8:
+        return False
+    return bool(abs(np.linalg.norm(rows[0][1][4:]) - 1) < 0.1)
 
 
 def write_kitti(path: Path, T: Array) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def camera_of(dataset: Dataset, title: str) -> Camera:
     return dataset.sensor.camera
 
 
-def write_png(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
+def write_png(path: Path, pixels: NDArray[Any]) -> None:
     """Write a grey image, or colour as RGB (height, width, 3)."""
     import cv2
 

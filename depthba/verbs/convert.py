@@ -185,7 +185,9 @@ def _datasets(
     from depthba.convert import importing
     from depthba.dataset import Dataset
 
-    datasets, kinds, notes = [], [], []
+    datasets: list[Dataset] = []
+    kinds: list[str] = []
+    notes: list[str] = []
     parent = dst.parent if dst.parent.is_dir() else None
     with tempfile.TemporaryDirectory(prefix=".convert-", dir=parent) as folder:
         for k, src in enumerate(sources):
@@ -235,9 +237,8 @@ def _list(json: bool) -> None:
         rows.append((one.name, ", ".join(ways), one.title))
     rows += [(r.name, "result", f"{r.title}: {' '.join(r.suffixes)}") for r in exporting.RESULTS]
     if json:
-        print_json(
-            {"formats": [dict(zip(("name", "ways", "title"), r, strict=True)) for r in rows]}
-        )
+        keys = ("name", "ways", "title")
+        print_json({"formats": [dict(zip(keys, row, strict=True)) for row in rows]})
         return
-    for name, ways, title in rows:
-        print(f"{name:<13} {ways:<8} {title}")
+    for name, way, title in rows:
+        print(f"{name:<13} {way:<8} {title}")
