@@ -79,6 +79,10 @@ class Tree:
         """Return the frame that a chain hangs from."""
         return self._edges[chain[-1]].parent
 
+    def moves(self, chain: tuple[str, ...]) -> bool:
+        """Tell whether anything of a chain is more than a fixed transform."""
+        return any(not self._edges[child].fixed for child in chain)
+
     def at(self, chain: tuple[str, ...], stamp: float, max_gap: float) -> Array | None:
         """Return T_root_frame (4, 4) of a chain at a stamp, s; None where tf does not reach."""
         T: Array = np.eye(4)

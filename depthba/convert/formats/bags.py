@@ -124,7 +124,8 @@ def _unit(store: stores.Store, topic: str, encoding: str, path: Path) -> float:
     sensor = "/".join(topic.split("/")[:3])
     options = [f"{sensor}/option/{name}/value" for name in ("Depth_Units", "Depth Units")]
     for _, _, message in store.messages(options):
-        return float(f"{message.data:.6g}")  # single precision of a decimal number
+        # a decimal number in single precision, or as text in recordings of ROS 2
+        return float(f"{float(message.data):.6g}")
     raise DatasetError(f"{path}: no {options[0]}, expected --depth-scale METRES")
 
 
@@ -153,6 +154,11 @@ def _from_tree(
     path: Path,
 ) -> tuple[pairing.Paired, tuple[str, ...]]:
     chain = tree.chain(frame_id, reading.fixed_frame)
+    if len(stamps) > 1 and not tree.moves(chain):
+        raise DatasetError(
+            f"{path}: tf has {frame_id} at rest in {tree.root(chain)}, expected a camera that "
+            "moves: --poses FILE in TUM format, or --fixed-frame"
+        )
     paired: pairing.Paired = []
     without = []
     for k, stamp in enumerate(stamps):
