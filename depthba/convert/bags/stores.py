@@ -105,7 +105,7 @@ class _Mcap:
 
     def message(self, topic: str, time: int) -> Any:
         for _, channel, message in self._reader.iter_messages(
-            topics=[topic], start_time=time, end_time=time + 1
+            topics=[topic], starting_at=time, ending_before=time + 1
         ):
             return self._decoded(channel, message)
         raise DatasetError(f"{self._path}: no message of {topic} at {time} ns")

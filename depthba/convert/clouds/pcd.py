@@ -172,7 +172,8 @@ def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
             length = control + 1
             if i + length > len(packed) or o + length > len(out):
                 return -1
-            out[o : o + length] = packed[i : i + length]
+            for k in range(length):
+                out[o + k] = packed[i + k]
             i += length
             o += length
             continue
