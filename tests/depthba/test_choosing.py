@@ -55,7 +55,10 @@ def test_a_crop_in_a_map_frame_that_is_chosen(dataset: Dataset) -> None:
     )
     T_map_world = moved.T_map_world()
     assert not np.allclose(T_map_world[:3, :3], np.eye(3), atol=0.1)
-    p = world(moved.crop((-0.2, 0.2, -0.2, 0.2, -9, 9))) @ T_map_world[:3, :3].T + T_map_world[:3, 3]
+    p = (
+        world(moved.crop((-0.2, 0.2, -0.2, 0.2, -9, 9))) @ T_map_world[:3, :3].T
+        + T_map_world[:3, 3]
+    )
     assert len(p) and np.abs(p[:, :2]).max() <= 0.2 + 1e-6
 
 

@@ -39,7 +39,9 @@ def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int,
 
     def header(stamp: float, frame: str) -> Any:
         whole = int(stamp)
-        moment = kinds["builtin_interfaces/msg/Time"](sec=whole, nanosec=round((stamp - whole) * 1e9))
+        moment = kinds["builtin_interfaces/msg/Time"](
+            sec=whole, nanosec=round((stamp - whole) * 1e9)
+        )
         more = {"seq": 0} if ros1 else {}
         return kinds["std_msgs/msg/Header"](stamp=moment, frame_id=frame, **more)
 
@@ -49,7 +51,9 @@ def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int,
             translation=kinds["geometry_msgs/msg/Vector3"](*T[:3, 3]),
             rotation=kinds["geometry_msgs/msg/Quaternion"](x, y, z, w),
         )
-        stamped = kinds["geometry_msgs/msg/TransformStamped"](header(stamp, parent), child, transform)
+        stamped = kinds["geometry_msgs/msg/TransformStamped"](
+            header(stamp, parent), child, transform
+        )
         return kinds["tf2_msgs/msg/TFMessage"]([stamped])
 
     fixed = tf(100.0, "body", "camera_optical", T_BODY_CAMERA)

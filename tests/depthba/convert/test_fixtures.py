@@ -94,7 +94,10 @@ def test_redwood_as_open3d_writes_it(tmp_path: Path) -> None:
     assert recording.format == "redwood"
     assert_allclose(recording.T_world_camera, poses(), rtol=0, atol=1e-7)  # it writes 8 decimals
     assert recording.frames[0].camera is not None
-    assert recording.frames[0].camera.matrix.tolist() == parameters[0].intrinsic.intrinsic_matrix.tolist()
+    assert (
+        recording.frames[0].camera.matrix.tolist()
+        == parameters[0].intrinsic.intrinsic_matrix.tolist()
+    )
 
 
 def test_nerfstudio_by_its_description(tmp_path: Path) -> None:
@@ -116,9 +119,7 @@ def test_nerfstudio_by_its_description(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == LENS  # centres at integers here
     frames[0]["fl_x"] = 81.0
     (tmp_path / "transforms.json").write_text(json.dumps({**head, "frames": frames}))
-    mixed = importing.into_dataset(
-        importing.read(tmp_path, Reading()), tmp_path / "out", Reading()
-    )
+    mixed = importing.into_dataset(importing.read(tmp_path, Reading()), tmp_path / "out", Reading())
     assert mixed.dataset.sensor.kind == "cloud"
     assert any("2 different intrinsics" in note for note in mixed.notes)
 

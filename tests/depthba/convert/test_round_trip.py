@@ -62,7 +62,9 @@ def test_depth_formats_keep_poses_and_depth(
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "las", "laz", "e57"])
-def test_cloud_formats_keep_poses_and_points(suffix: str, cloud_set: Dataset, tmp_path: Path) -> None:
+def test_cloud_formats_keep_poses_and_points(
+    suffix: str, cloud_set: Dataset, tmp_path: Path
+) -> None:
     pytest.importorskip({"las": "laspy", "laz": "laspy", "e57": "pye57"}.get(suffix, "numpy"))
     back = there_and_back(cloud_set, f"clouds-{suffix}", tmp_path)
     assert back.format == "clouds"
