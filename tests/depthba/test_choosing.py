@@ -77,7 +77,7 @@ def test_masks_out_of_arrays_files_and_folders(dataset: Dataset, tmp_path: Path)
     assert [bool(np.isfinite(frame.depth()).any()) for frame in each] == [False, True] * 3
     with pytest.raises(DatasetError, match=r"mask of shape \(80, 60\), expected"):
         dataset.masked(mask.T)
-    with pytest.raises(DatasetError, match="gone.png: no such file"):
+    with pytest.raises(DatasetError, match=r"gone.png: no such file"):
         dataset.masked(tmp_path / "gone.png")
 
 

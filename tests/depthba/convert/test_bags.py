@@ -204,7 +204,7 @@ def test_a_realsense_recording_takes_its_poses_from_a_file(tmp_path: Path) -> No
     sensor.stop()
     sensor.close()
     del sensor, recorder
-    with pytest.raises(DatasetError, match="at rest in .*--poses FILE in TUM format"):
+    with pytest.raises(DatasetError, match=r"at rest in .*--poses FILE in TUM format"):
         importing.read(path, Reading())
     lasting = tmp_path / "poses.txt"
     write_tum(lasting, np.array([-1.0, 100.0]), np.tile(np.eye(4), (2, 1, 1)))
