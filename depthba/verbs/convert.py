@@ -141,8 +141,11 @@ def _to_dataset(src: Path, dst: Path, arguments: Arguments) -> dict[str, Any]:
     from depthba.convert import importing
 
     choice, reading = arguments.choice, arguments.reading
+    sources = [src, *arguments.merge]
+    if all(map(importing.is_dataset, sources)) and reading.poses is not None:
+        raise OptionError(f"{src}: --poses of a dataset goes with --to another format alone")
     if importing.is_dataset(src) or arguments.merge or choice.cuts or _is_run(src):
-        with _datasets([src, *arguments.merge], dst, reading) as (datasets, kinds, notes):
+        with _datasets(sources, dst, reading) as (datasets, kinds, notes):
             datasets = [choice.applied(dataset) for dataset in datasets]
             merged = datasets[0] if len(datasets) == 1 else type(datasets[0]).merge(datasets)
             saved = merged.save(dst)
@@ -169,7 +172,7 @@ def _to_other(
         exporting.write(outcome, kind, dst)
         return _told("run", kind.name, len(outcome.stamps), [])
     with _datasets([src, *arguments.merge], dst, reading) as (datasets, kinds, notes):
-        poses = reading.poses if "depthba" in kinds else None
+        poses = reading.poses if set(kinds) == {"depthba"} else None
         datasets = [choice.applied(dataset) for dataset in datasets]
         merged = datasets[0] if len(datasets) == 1 else type(datasets[0]).merge(datasets)
         outcome = Outcome.of_dataset(merged, exporting.poses_of(merged, poses, reading.max_gap))
@@ -185,6 +188,12 @@ def _datasets(
     from depthba.convert import importing
     from depthba.dataset import Dataset
 
+    ours = all(map(importing.is_dataset, sources))
+    if ours and replace(reading, poses=None, max_gap=Reading().max_gap) != Reading():
+        raise OptionError(
+            f"{sources[0]}: a dataset says by itself how it is meant, expected no options of how "
+            "to read a source"
+        )
     datasets: list[Dataset] = []
     kinds: list[str] = []
     notes: list[str] = []

@@ -203,6 +203,8 @@ def test_convert_cuts_merges_and_says_what_it_did(
             ["{set}", "{new}", "--to", "tum-rgbd", "--poses", "best"],
             "no poses 'best', expected one",
         ),
+        (["{set}", "{new}", "--poses", "true"], "goes with --to another format alone"),
+        (["{set}", "{new}", "--axes", "opengl"], "a dataset says by itself how it is meant"),
         (["{bare}", "{new}", "--kind", "colmap"], "--kind colmap: is written only, not read"),
         (["{bare}", "{new}", "--kind", "tum-rgbd"], "depth.txt: no such file"),
     ],
