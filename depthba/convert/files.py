@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.dataset.faults import MalformedError
+from depthba.dataset.images import png_chunks
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -165,4 +167,9 @@ def _bytes(path: Path) -> bytes:
         raise DatasetError(f"{path}: {error.strerror}, expected a readable image") from error
     if not data:
         raise DatasetError(f"{path}: empty, expected an image")
+    if path.suffix.lower() == ".png":  # the decoder would talk about it on stderr
+        try:
+            png_chunks(data)
+        except MalformedError as error:
+            raise DatasetError(f"{path}: {error}") from error
     return data

@@ -48,6 +48,8 @@ def recognise(path: Path) -> Format:
     """
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
+    if (path / "result.json").is_file():
+        raise DatasetError(f"{path}: a run of depthba, expected a dataset or another source")
     found = [(f, told) for f in _formats() if f.read is not None and (told := f.recognise(path))]
     specific = [row for row in found if not row[0].generic] or found
     if len(specific) == 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,3 +95,26 @@ def test_a_bare_folder_asks_for_what_it_cannot_know(tmp_path: Path) -> None:
     small_scene.write_png(path / "007.png", small_scene.millimetres(small_scene.poses()[0]))
     with pytest.raises(DatasetError, match="6 poses for 7 frames"):
         importing.read(path, READING)
+
+
+def test_a_damaged_image_is_named_in_a_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = folder(tmp_path / "set", Convention())
+    whole = (path / "002.png").read_bytes()
+    for data, told in (
+        (whole[: len(whole) // 2], "002.png: PNG of .* bytes is cut off"),
+        (whole[:60] + b"?" + whole[61:], "002.png: PNG chunk 'IDAT' has a wrong check sum"),
+        (b"", "002.png: empty, expected an image"),
+        (b"GIF89a", "002.png: begins with b'GIF89a', expected a PNG file"),
+    ):
+        (path / "002.png").write_bytes(data)
+        with pytest.raises(DatasetError, match=told):
+            importing.into_dataset(
+                importing.read(path, replace(READING, unchecked=True)), tmp_path / "out", READING
+            )
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    small_scene.write_png(path / "002.png", np.zeros((60, 80), np.uint8))
+    with pytest.raises(DatasetError, match=r"002.png: pixels of type uint8, expected 16-bit depth"):
+        importing.read(path, READING)
+    assert capfd.readouterr().err == ""

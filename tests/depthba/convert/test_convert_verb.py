@@ -225,6 +225,14 @@ def test_errors_are_one_line_and_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_is_no_source(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["register", str(run), "--out", str(tmp_path / "out")]) == 1
+    assert f"{run}: a run of depthba, expected a dataset" in capsys.readouterr().err
+    assert cli.main(["convert", str(run), str(tmp_path / "out")]) == 1
+    assert f"{run}: a run, expected a dataset; or --to NAME" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_dataset_takes_no_options_of_reading(
     depth_set: Dataset, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
