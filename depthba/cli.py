@@ -70,6 +70,10 @@ VERBS = {
         extra="eval",
         needs=("rerun",),
     ),
+    "convert": Verb(
+        "depthba.verbs.convert",
+        "Turn other people's data into datasets, and results into other people's files.",
+    ),
     "doctor": Verb("depthba.verbs.doctor", "Check this machine, or a dataset."),
 }
 

@@ -5,8 +5,9 @@ One dataclass is the argument, the command line and the saved file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,26 @@ class Options:
     prior_r: float | None = None
     """Standard deviation of the measured rotations, rad. None: the dataset's pose_noise, else 0.02
     (paper: no prior)."""
+    depth_range: tuple[float, float] | None = None
+    """Least and greatest depth that counts (z in the sensor frame), m."""
+    every: int = 1
+    """Take every n-th frame alone, from the first on."""
+    mask: str | None = None
+    """Image, of which pixels that are 0 are left out of every frame; or a folder of one image a
+    frame, named as its depth image."""
     max_iterations: int = 30
     """Limit for each level and phase."""
     time_limit: float | None = None
     """Seconds after which no further iteration begins; what was reached by then is judged and
     returned. None: no limit."""
+
+
+def options_of(config: Mapping[str, Any]) -> Options:
+    """Return the options that a run saved; those that this version does not know are left out."""
+    known = {field.name for field in fields(Options)}
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in config.items()
+        if key in known
+    }
+    return Options(**values)

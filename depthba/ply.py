@@ -6,6 +6,7 @@ Only what point clouds need: the scalar properties of one vertex element.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,7 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536
+Real = TypeVar("Real", np.float32, np.float64)
 
 
 def read_ply_points(path: str | Path) -> NDArray[np.float32]:
@@ -44,7 +46,11 @@ def read_ply_points(path: str | Path) -> NDArray[np.float32]:
     return parse_ply_points(data, str(path))
 
 
-def parse_ply_points(data: bytes, name: str) -> NDArray[np.float32]:
+def parse_ply_points(
+    data: bytes,
+    name: str,
+    dtype: type[Real] = np.float32,  # type: ignore[assignment]
+) -> NDArray[Real]:
     """Read the points (n, 3) from a binary PLY file's bytes; ``name`` is for the `DatasetError`."""
     order, elements, start = _parse_header(data, name)
     for position, (element, count, properties) in enumerate(elements):
@@ -54,25 +60,25 @@ def parse_ply_points(data: bytes, name: str) -> NDArray[np.float32]:
                 f"{name}: element {element!r} has a list property before or in the vertices,"
                 " expected only scalars there"
             )
-        dtype = _dtype(order, properties, name)
-        end = start + count * dtype.itemsize
+        row = _dtype(order, properties, name)
+        end = start + count * row.itemsize
         if end > len(data):
             raise DatasetError(
                 f"{name}: {len(data) - start} bytes of data for element {element!r},"
-                f" expected {count} x {dtype.itemsize} = {count * dtype.itemsize}"
+                f" expected {count} x {row.itemsize} = {count * row.itemsize}"
             )
         if element != "vertex":
             start = end
             continue
         for axis in "xyz":
-            if dtype.names is None or axis not in dtype.names or dtype[axis].kind != "f":
+            if row.names is None or axis not in row.names or row[axis].kind != "f":
                 raise DatasetError(f"{name}: no float property {axis!r}, expected x, y and z")
         if last and end != len(data):
             raise DatasetError(
                 f"{name}: {len(data) - end} bytes after the last of {count} vertices, expected none"
             )
-        vertices = np.frombuffer(data, dtype=dtype, count=count, offset=start)
-        return np.stack([vertices[axis].astype(np.float32) for axis in "xyz"], axis=-1)
+        vertices = np.frombuffer(data, dtype=row, count=count, offset=start)
+        return np.stack([vertices[axis].astype(dtype) for axis in "xyz"], axis=-1)
     raise DatasetError(f"{name}: no element 'vertex' in the PLY header")
 
 

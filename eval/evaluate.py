@@ -18,8 +18,10 @@ from depthba.clouds import inside, load_clouds, point_spacing, transform
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import OptionError, RunError
+from depthba.options import options_of
 from depthba.picture import CELL_SPACINGS
 from depthba.run_folder import Run
+from depthba.selecting import selected
 from eval.bound import Bound
 from eval.bound import bound as cramer_rao
 from eval.map_metrics import cloud_metrics, height_metrics, patches, seen_nodes
@@ -269,7 +271,8 @@ def open_dataset(run: Run, path: str | os.PathLike[str] | None) -> Dataset:
         raise RunError(
             f"{run.path}: its dataset {run.dataset_path} is not there; say where with --dataset"
         )
-    return Dataset.open(run.dataset_path if path is None else Path(path))
+    dataset = Dataset.open(run.dataset_path if path is None else Path(path))
+    return selected(dataset, options_of(run.config))
 
 
 def match_stamps(have: Floats, want: Floats, wanted_by: str, owner: str) -> NDArray[np.int64]:

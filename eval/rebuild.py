@@ -6,7 +6,6 @@ of every iteration, the figures. The poses and maps between are gone.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from depthba.dataset import Dataset
 from depthba.errors import RunError
-from depthba.options import Options
+from depthba.options import Options, options_of
 from depthba.result import FrameReport, Result, WeakDirection
 from depthba.run_folder import Run
 from eval.evaluate import open_dataset
@@ -95,11 +94,7 @@ def archived_result(run: Run, dataset: Dataset) -> Result:
 
 def archived_options(run: Run) -> Options:
     """Return the options of a run; those that this version does not know are left out."""
-    known = {f.name for f in dataclasses.fields(Options)}
-    values = {k: v for k, v in run.config.items() if k in known}
-    if values.get("roi") is not None:
-        values["roi"] = tuple(values["roi"])
-    return Options(**values)
+    return options_of(run.config)
 
 
 def archived_metrics(run: Path) -> list[Metric]:

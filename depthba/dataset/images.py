@@ -116,8 +116,8 @@ def _decode(
     return np.asarray(pixels, dtype=dtype)
 
 
-def _check(png: bytes, width: int, height: int, bits: int, channels: str) -> None:
-    """Refuse bytes that are no whole PNG of that size and type, before anything is decoded."""
+def png_chunks(png: bytes) -> tuple[bytes, list[bytes]]:
+    """Return the header and the packed data of a PNG. `MalformedError`: it is not whole."""
     if not png.startswith(_SIGNATURE):
         raise MalformedError(f"begins with {png[:8]!r}, expected a PNG file")
     at, kind, header, packed = len(_SIGNATURE), b"", b"", []
@@ -138,6 +138,12 @@ def _check(png: bytes, width: int, height: int, bits: int, channels: str) -> Non
         at = end
     if len(header) != 13:
         raise MalformedError("PNG without an image header")
+    return header, packed
+
+
+def _check(png: bytes, width: int, height: int, bits: int, channels: str) -> None:
+    """Refuse bytes that are no whole PNG of that size and type, before anything is decoded."""
+    header, packed = png_chunks(png)
     found_width, found_height, found_bits, colour, *_, interlace = struct.unpack(">IIBBBBB", header)
     found = _CHANNELS.get(colour, f"colour type {colour}")
     if (found_bits, found) != (bits, channels):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.dataset import loading
+from depthba.dataset.cutting import Cut
 from depthba.dataset.faults import MalformedError
 from depthba.dataset.sensor import Sensor
 from depthba.errors import DatasetError
@@ -49,14 +50,20 @@ class Frame:
     """(4, 4), where known."""
     record: Mapping[str, Any] = field(repr=False, default_factory=dict)
     """The whole line of frames.jsonl, unknown keys too."""
+    cuts: tuple[Cut, ...] = field(repr=False, default=())
+    """What is left out when it is loaded, see `Dataset.crop`."""
 
     def depth(self) -> NDArray[np.float32]:
         """Return depth (height, width), metres; NaN where nothing was measured in range."""
         stored = self._stored("depth")
         try:
-            return loading.load_depth(self.root / stored.path, stored.sha256, self.sensor)
+            depth = loading.load_depth(self.root / stored.path, stored.sha256, self.sensor)
         except MalformedError as error:
             raise self._error(stored, error) from error
+        assert self.sensor.camera is not None  # there is a depth image
+        for cut in self.cuts:
+            depth = cut.depth(depth, self.sensor.camera)
+        return depth
 
     def rgb(self) -> NDArray[np.uint8] | None:
         """Return colour (height, width, 3) as RGB, or None where the frame has none."""
@@ -77,9 +84,12 @@ class Frame:
             return self.sensor.camera.backproject(self.depth()).astype(np.float32)
         stored = self._stored("cloud")
         try:
-            return loading.load_cloud(self.root / stored.path, stored.sha256, self.sensor)
+            points = loading.load_cloud(self.root / stored.path, stored.sha256, self.sensor)
         except MalformedError as error:
             raise self._error(stored, error) from error
+        for cut in self.cuts:
+            points = cut.points(points)
+        return points
 
     def _stored(self, kind: str) -> StoredFile:
         if kind not in self.files:

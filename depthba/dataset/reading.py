@@ -10,13 +10,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.dataset.choosing import as_stored, crop, map_frame, masked, merge
+from depthba.dataset.cutting import Bounds, Roi
 from depthba.dataset.extras import read_calibration, read_markers
 from depthba.dataset.faults import Faults
 from depthba.dataset.header import read_header
 from depthba.dataset.listing import Entry, join, pose_file, read_entries, read_poses
 from depthba.dataset.model import Frame, Marker
+from depthba.dataset.saving import save
 from depthba.dataset.sensor import PoseNoise, Sensor
-from depthba.errors import DatasetError
+from depthba.errors import DatasetError, OptionError
 
 Array = NDArray[np.float64]
 
@@ -126,6 +129,71 @@ class Dataset:
         gone = {frame.id for frame in self.frames} - {frame.id for frame in kept}
         return replace(self, frames=kept, left_out=self.left_out | gone)
 
+    def crop(
+        self,
+        roi: Roi | None = None,
+        *,
+        heights: Bounds | None = None,
+        depths: Bounds | None = None,
+    ) -> Dataset:
+        """Return the dataset with what lies outside left out of its frames as they are loaded.
+
+        Args:
+            roi: xmin xmax ymin ymax zmin zmax in the map frame, m, at the measured poses.
+            heights: lowest and highest z in the map frame, m; the same as the end of ``roi``.
+            depths: least and greatest z in the sensor frame, m.
+
+        Raises:
+            OptionError: a lower bound is not below its upper bound.
+
+        """
+        return crop(self, roi, heights=heights, depths=depths)
+
+    def masked(self, mask: NDArray[Any] | str | Path) -> Dataset:
+        """Return the dataset with the pixels alone that a mask has as not 0.
+
+        Args:
+            mask: (height, width); or an image file; or a folder of one image a frame, each named as
+                the frame's depth image. For depth images only.
+
+        Raises:
+            DatasetError: a mask is missing, no image, or not of the sensor's size.
+
+        """
+        return masked(self, mask)
+
+    def subsample(self, every: int) -> Dataset:
+        """Return the dataset with every ``every``-th frame alone, from the first on."""
+        if every < 1:
+            raise OptionError(f"every is {every}, expected 1 or more")
+        return self.subset(range(0, len(self), every))
+
+    @staticmethod
+    def merge(datasets: Sequence[Dataset], name: str = "") -> Dataset:
+        """Return one dataset with the frames of several, whose poses are in one world.
+
+        Frames are numbered anew. Where stamps meet, those of a later dataset are shifted, all
+        by the same. Files stay where they are; `save` writes the whole into one folder.
+
+        Raises:
+            DatasetError: none is given, or their sensors differ.
+
+        """
+        return merge(datasets, name)
+
+    def save(self, path: str | Path) -> Dataset:
+        """Write the dataset as it stands, cuts and all, into a new folder; return that, opened.
+
+        Raises:
+            DatasetError: something is in the way, or a file of a frame is damaged.
+
+        """
+        return save(self, Path(path))
+
+    def T_map_world(self) -> Array:
+        """Return (4, 4), the map frame that a registration from the measured poses takes."""
+        return map_frame(self)
+
     @property
     def ids(self) -> tuple[int, ...]:
         """The frames' ids."""
@@ -144,7 +212,8 @@ class Dataset:
     @property
     def T_world_camera_true(self) -> Array | None:
         """(N, 4, 4), the truth, or None where it is not known. `DatasetError`: a frame lacks it."""
-        if not (self.path / pose_file("true")).exists():
+        roots = {self.path, *(frame.root for frame in self.frames)}
+        if not all((root / pose_file("true")).exists() for root in roots):
             return None
         return self.poses("true")
 
@@ -153,22 +222,42 @@ class Dataset:
 
         Raises `DatasetError` where there is no such file, it is malformed, or a frame has no pose.
         """
-        if not (self.path / pose_file(name)).exists() or Path(name).name != name:
-            here = sorted(p.name[6:-4] for p in self.path.glob(pose_file("*")))
-            raise DatasetError(f"{self.path}: no poses {name!r}, expected one of {', '.join(here)}")
-        return _poses(self.path, name, self.frames, Faults(self.path))[0]
+        out = np.empty((len(self.frames), 4, 4))
+        for root, rows in self._roots().items():
+            if not (root / pose_file(name)).exists() or Path(name).name != name:
+                here = sorted(p.name[6:-4] for p in root.glob(pose_file("*")))
+                raise DatasetError(f"{root}: no poses {name!r}, expected one of {', '.join(here)}")
+            stored = [as_stored(self.frames[row]) for row in rows]
+            out[rows] = _poses(root, name, stored, Faults(root))[0]
+        return out
 
     def markers(self) -> tuple[Marker, ...]:
         """Return the markers with known position; empty where there is no markers.json."""
-        found = read_markers(self.path, {*self.ids, *self.left_out}, Faults(self.path))
-        return tuple(
-            replace(m, observations=tuple(o for o in m.observations if o[0] not in self.left_out))
-            for m in found
-        )
+        merged: dict[str, Marker] = {}
+        for root, rows in self._roots().items():
+            new_id = {as_stored(self.frames[row]).id: self.frames[row].id for row in rows}
+            listed = {*new_id, *self.left_out} if root == self.path else _listed(root)
+            for marker in read_markers(root, listed, Faults(root)):
+                seen = tuple((new_id[i], p) for i, p in marker.observations if i in new_id)
+                before = merged[marker.name].observations if marker.name in merged else ()
+                merged[marker.name] = replace(marker, observations=before + seen)
+        return tuple(merged.values())
+
+    def _roots(self) -> dict[Path, list[int]]:
+        """Return the folders that the frames lie in, with the positions of the frames."""
+        roots: dict[Path, list[int]] = {} if self.frames else {self.path: []}
+        for row, frame in enumerate(self.frames):
+            roots.setdefault(frame.root, []).append(row)
+        return roots
 
     def calibration(self) -> dict[str, Any] | None:
         """Return calibration.json, checked, or None where there is none."""
         return read_calibration(self.path, Faults(self.path))
+
+
+def _listed(root: Path) -> set[int]:
+    """Return the ids of all frames in a folder."""
+    return {entry.id for entry in read_entries(root, None, Faults(root))[0]}
 
 
 def _poses(

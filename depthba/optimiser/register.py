@@ -22,6 +22,7 @@ from depthba.optimiser.start import pose_sigmas, start_poses
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration, Result
+from depthba.selecting import selected
 
 
 def register(
@@ -51,6 +52,7 @@ def register(
     schedule.check(options)
     if not isinstance(dataset, Dataset):
         dataset = Dataset.open(dataset)
+    dataset = selected(dataset, options)
     clock = Clock(options.time_limit)
     workers = Workers(options.threads or os.cpu_count() or 1, cancel)
     try:

@@ -23,6 +23,12 @@ SERVES = {
     "open3d": "a baseline, and views of clouds",
     "small-gicp": "a baseline",
     "gtsam": "pose graphs of the baselines",
+    "rosbags": "reads bags of ROS 1 and 2",
+    "mcap": "reads MCAP",
+    "laspy": "reads and writes LAS and LAZ",
+    "pye57": "reads and writes E57",
+    "tifffile": "writes GeoTIFF",
+    "trimesh": "writes meshes",
     "distributed": "generates on many machines",
 }
 """What an optional package is good for, for people."""

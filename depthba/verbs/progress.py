@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -12,6 +13,10 @@ from depthba.verbs.output import angle, length
 
 if TYPE_CHECKING:
     from depthba.result import Iteration
+
+
+SELDOM = 5.0
+"""Seconds between plain lines of a count."""
 
 
 class Bar:
@@ -63,6 +68,23 @@ class Bar:
             self._console.print(f"{self._name}: {state}", markup=False)
         else:
             self._bar.update(self._task, total=total, completed=done, state=state)
+
+
+class Counter(Bar):
+    """A callback for work of known length: so many of so many."""
+
+    def __init__(self, name: str, what: str) -> None:
+        """``name`` stands in front of the bar and of every line; ``what`` is counted."""
+        super().__init__(name, "", TimeElapsedColumn())
+        self._what = what
+        self._told = time.monotonic()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show how far it has come; without a terminal every few seconds, and at the end."""
+        now = time.monotonic()
+        if self.drawn or done == total or now - self._told > SELDOM:
+            self._told = now
+            self.show(f"{done} of {total} {self._what}s", done, total)
 
 
 class RegistrationProgress(Bar):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from depthba.errors import MissingPackage
+from depthba.convert import Reading
+from depthba.errors import MissingPackage, OptionError
 from depthba.options import Options
 from depthba.verbs import DONE, NOT_TO_BE_TRUSTED, WRONG_USAGE
 from depthba.verbs.output import angle, length, note, print_json
@@ -21,6 +22,10 @@ from depthba.verbs.output import angle, length, note, print_json
 if TYPE_CHECKING:
     from depthba.dataset import Dataset
     from depthba.result import FrameReport, Iteration, Result
+
+
+DATASET = "dataset"
+"""Folder of a run that holds what was converted for it."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,8 @@ class Arguments:
     """
 
     dataset: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of the dataset."""
+    """Folder of the dataset; or a source of another format, as `depthba convert` takes it, which
+    becomes the folder dataset of the run."""
     out: Path | None = None
     """Folder for the run, new or empty. None: logs/<name>-<yyyymmdd-hhmmss>."""
     overwrite: bool = False
@@ -43,6 +49,7 @@ class Arguments:
     web: bool = False
     """With --live: serve to a browser, on 127.0.0.1 alone, in place of opening a window."""
     options: Options = field(default_factory=Options)
+    reading: Reading = field(default_factory=Reading)
 
 
 @dataclass(frozen=True)
@@ -63,19 +70,34 @@ class Outcome:
 def run(arguments: Arguments) -> int:
     """Register a dataset, write the run folder, say how it went; return the exit status."""
     from depthba.dataset import Dataset
+    from depthba.run_folder import default_path
 
     if arguments.web and not arguments.live:
         note("depthba register: --web goes with --live alone; `depthba review --web` comes after")
         return WRONG_USAGE
-    dataset = Dataset.open(arguments.dataset)
-    for warning in dataset.warnings:
-        note(f"warning: {warning}")
-    with _viewer(arguments) as viewer:
+    with contextlib.ExitStack() as stack:
+        out, overwrite, options = arguments.out, arguments.overwrite, arguments.options
+        source = arguments.dataset
+        if source.exists() and not (source / "dataset.json").exists():
+            out = default_path(source.stem) if out is None else out
+            stack.enter_context(removed_on_failure(out, overwrite))
+            dataset = _imported(arguments, out)
+            overwrite, options = True, replace(options, every=1)
+        else:
+            if arguments.reading != Reading():
+                raise OptionError(
+                    f"{source}: a dataset says by itself how it is meant, expected no options of "
+                    "how to read a source"
+                )
+            dataset = Dataset.open(source)
+        for warning in dataset.warnings:
+            note(f"warning: {warning}")
+        viewer = stack.enter_context(_viewer(arguments))
         outcome = register_into(
             dataset,
-            arguments.options,
-            arguments.out,
-            arguments.overwrite,
+            options,
+            out,
+            overwrite,
             viewer=None if viewer is None else viewer.address,
         )
         if arguments.json:
@@ -85,6 +107,22 @@ def run(arguments: Arguments) -> int:
         if viewer is not None:
             viewer.stay()
     return DONE if outcome.result.trusted else NOT_TO_BE_TRUSTED
+
+
+def _imported(arguments: Arguments, out: Path) -> Dataset:
+    """Convert a source of another format into the run's own folder, where evaluate finds it."""
+    from depthba.run_folder import RunFolder
+    from depthba.verbs.convert import import_into
+
+    RunFolder.create(out, overwrite=arguments.overwrite)
+    if arguments.overwrite and (out / DATASET).is_dir():
+        shutil.rmtree(out / DATASET)
+    imported = import_into(
+        out / DATASET, arguments.dataset, arguments.reading, arguments.options.every
+    )
+    for text in imported.notes:
+        note(f"note: {text}")
+    return imported.dataset
 
 
 def register_into(
@@ -113,13 +151,15 @@ def register_into(
     """
     import depthba
     from depthba.run_folder import RunFolder, default_path
+    from depthba.selecting import selected
     from depthba.verbs.progress import RegistrationProgress
 
+    taking_part = selected(dataset, options)
     path = default_path(dataset.name) if out is None else out
     with removed_on_failure(path, overwrite):
         folder = RunFolder.create(path, overwrite=overwrite)
         with (
-            _recorder(path / "run.rrd", dataset, options, record, viewer) as recorder,
+            _recorder(path / "run.rrd", taking_part, options, record, viewer) as recorder,
             RegistrationProgress(dataset.name) as progress,
         ):
             callback = _Callback(progress, recorder)
@@ -127,7 +167,7 @@ def register_into(
             result = depthba.register(dataset, options, callback=callback)
             seconds = time.perf_counter() - begin - callback.seconds
             progress.say("writing the run")
-            folder.write(result, options, dataset)
+            folder.write(result, options, taking_part)
             metrics = importlib.import_module("eval.evaluate").evaluate(path) if evaluate else []
             if recorder is not None:
                 recorder.finish(result, metrics)
@@ -223,7 +263,7 @@ def _first(title: str, items: list[str], most: int) -> list[str]:
     return lines
 
 
-@contextmanager
+@contextlib.contextmanager
 def removed_on_failure(path: Path, overwrite: bool) -> Iterator[None]:
     """On any failure, interrupts too, remove what was begun in a folder.
 
@@ -248,7 +288,7 @@ def removed_on_failure(path: Path, overwrite: bool) -> Iterator[None]:
         raise
 
 
-@contextmanager
+@contextlib.contextmanager
 def _viewer(arguments: Arguments) -> Iterator[Any]:
     """Give a viewer from the package above; where it is not wanted, None."""
     if not arguments.live:
@@ -265,7 +305,7 @@ def _viewer(arguments: Arguments) -> Iterator[Any]:
         yield viewer
 
 
-@contextmanager
+@contextlib.contextmanager
 def _recorder(
     path: Path, dataset: Dataset, options: Options, wanted: bool, viewer: str | None
 ) -> Iterator[Any]:

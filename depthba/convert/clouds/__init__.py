@@ -1,0 +1,1 @@
+"""Files of points: PLY, PCD, XYZ, LAS, LAZ, E57."""

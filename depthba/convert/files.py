@@ -1,0 +1,175 @@
+"""Finding and loading the files of a source. `DatasetError` names the file and the fault."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.dataset.faults import MalformedError
+from depthba.dataset.images import png_chunks
+from depthba.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+DEPTH_SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".npy")
+COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
+
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Return files by the numbers in their names, so that 10 comes after 9."""
+
+    def key(path: Path) -> list[tuple[int, int, str]]:
+        words = re.split(r"(\d+)", path.name)
+        return [(1, int(w), "") if w.isdecimal() else (0, 0, w) for w in words]
+
+    return sorted(files, key=key)
+
+
+def listed(folder: Path, suffixes: Sequence[str], pattern: str = "*") -> list[Path]:
+    """Return the files of a folder with one of the suffixes, in order; none where it is absent."""
+    if not folder.is_dir():
+        return []
+    return in_order(p for p in folder.glob(pattern) if p.suffix.lower() in suffixes and p.is_file())
+
+
+def text(path: Path) -> str:
+    """Return a text file."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: {error.strerror}, expected a readable file") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file."""
+    try:
+        value = json.loads(text(path))
+    except ValueError as error:
+        raise DatasetError(f"{path}: not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise DatasetError(f"{path}: holds {type(value).__name__}, expected a JSON object")
+    return value
+
+
+def numbers(path: Path, *columns: int, row_limit: int | None = None) -> Array:
+    """Return the rows (n, c) of a text file of numbers, c one of ``columns``; # is a comment."""
+    rows: list[list[float]] = []
+    for at, line in enumerate(text(path).splitlines(), 1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            raise DatasetError(f"{path}: line {at}: {line[:60]!r}, expected numbers") from None
+        if len(words) not in columns or len(words) != len(rows[0]):
+            expected = " or ".join(map(str, columns))
+            raise DatasetError(
+                f"{path}: line {at}: {len(words)} numbers, expected {expected} on every line"
+            )
+        if len(rows) == row_limit:
+            break
+    return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+
+
+def matrix(path: Path, rows: int = 4) -> Array:
+    """Return the one matrix (4, 4) or (3, 4) that a text file holds, as (4, 4)."""
+    M = numbers(path, 4, row_limit=rows)
+    if len(M) == 3:
+        M = np.vstack([M, [0, 0, 0, 1]])
+    if M.shape != (4, 4):
+        raise DatasetError(f"{path}: {len(M)} rows of 4 numbers, expected 4")
+    return M
+
+
+def depth_image(
+    path: Path, scale: float, invalid: tuple[int, ...] = (), *, floats: bool = False
+) -> Callable[[], Array]:
+    """Return what loads a depth image as (height, width), m, NaN where nothing was measured.
+
+    Args:
+        path: an image of one channel, or .npy.
+        scale: metres per unit.
+        invalid: values beside 0 that are no measurement.
+        floats: whether pixels may be floating-point numbers.
+
+    """
+    return partial(_load_depth, path, scale, invalid, floats)
+
+
+def colour_image(path: Path) -> Callable[[], NDArray[np.uint8]]:
+    """Return what loads a colour image as (height, width, 3), RGB."""
+    return partial(_load_colour, path)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return the width and height of an image, pixels."""
+    pixels = _pixels(path)
+    return int(pixels.shape[1]), int(pixels.shape[0])
+
+
+def _load_depth(path: Path, scale: float, invalid: tuple[int, ...], floats: bool) -> Array:
+    pixels = _pixels(path)
+    if pixels.ndim != 2:
+        raise DatasetError(f"{path}: {pixels.shape[2:]} channels, expected one of depth")
+    if pixels.dtype not in (np.uint16, np.uint32) and not (floats and pixels.dtype.kind == "f"):
+        kinds = "16-bit" + (" or floating-point" if floats else "")
+        raise DatasetError(f"{path}: pixels of type {pixels.dtype}, expected {kinds} depth")
+    z = pixels * np.float64(scale)
+    gone = ~np.isfinite(z) | (pixels <= 0)
+    for value in invalid:
+        gone |= pixels == value
+    z[gone] = np.nan
+    return np.asarray(z)
+
+
+def _load_colour(path: Path) -> NDArray[np.uint8]:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DatasetError(f"{path}: cannot be decoded, expected a colour image")
+    return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
+
+
+def _pixels(path: Path) -> NDArray[Any]:
+    import cv2
+
+    if path.suffix.lower() == ".npy":
+        try:
+            array = np.load(path, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path}: {error}, expected an array of depth") from error
+        return np.asarray(array.squeeze(-1) if array.ndim == 3 and array.shape[2] == 1 else array)
+    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DatasetError(f"{path}: cannot be decoded, expected a depth image")
+    return np.asarray(image)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: no such file, expected an image") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: {error.strerror}, expected a readable image") from error
+    if not data:
+        raise DatasetError(f"{path}: empty, expected an image")
+    if path.suffix.lower() == ".png":  # the decoder would talk about it on stderr
+        try:
+            png_chunks(data)
+        except MalformedError as error:
+            raise DatasetError(f"{path}: {error}") from error
+    return data

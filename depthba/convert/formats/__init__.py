@@ -1,0 +1,1 @@
+"""Formats of other people, one module each; `FORMAT` in it says what it can do."""

@@ -1,0 +1,213 @@
+"""Whether frames overlap under the convention of their poses; and if not, under which other.
+
+A wrong convention is no fault that a file shows: it puts frames apart that saw the same ground. So
+a few pairs of frames are laid on one another, and where the points of the one find hardly any of
+the other, the other conventions are tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba import se3
+from depthba.convert.reading import Axes, Direction
+from depthba.convert.recording import Convention, Recording
+from depthba.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+PAIRS = 6
+"""Pairs of frames that are laid on one another."""
+FIXED_POINTS, MOVED_POINTS = 20_000, 1500
+"""Points of the one frame, and of the other, at most."""
+TURN, SHIFT = 0.2, 0.25
+"""A pair has moved enough when it has turned by that, rad, or shifted by that part of the range."""
+TOLERANCE = 0.02
+"""Of the range: points that near are the same."""
+FACTORS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
+"""Between the units of poses and of depth that people mix up."""
+LEAST_SHIFT = 0.01
+"""Of the range. Poses that hardly move at all lay any two frames on one another."""
+GOOD, BETTER = 0.3, 0.2
+"""Another convention explains the frames when that part of the points agrees, and it is that much
+more, and at least twice as many."""
+AS_GOOD = 0.8
+"""With that part of the declared convention's share, another is as good."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found."""
+
+    share: float
+    """Of points that agree under the convention, mean over the pairs; NaN where none could tell."""
+    best: Convention
+    """The one that explains the frames."""
+    best_share: float
+    as_good: tuple[Convention, ...] = ()
+    """Others that the overlap cannot tell from the declared one."""
+
+
+def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
+    """Return what the overlap says, and notes.
+
+    Raises:
+        DatasetError: the frames overlap under another convention, not under this one.
+
+    """
+    verdict = judge(recording)
+    declared = recording.convention
+    if np.isnan(verdict.share):
+        return verdict, ("too few points or poses to see whether the conventions are right",)
+    if verdict.best != declared:
+        raise DatasetError(
+            f"{recording.path}: frames agree in {verdict.share:.0%} of their points with "
+            f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
+            f"expected {_options(declared, verdict.best, recording)}, or --unchecked"
+        )
+    notes = (f"frames agree in {verdict.share:.0%} of their points with {declared}",)
+    if verdict.share < 0.1:
+        notes = (
+            f"{notes[0]}, which is little, but no other convention does better: "
+            "are the poses those of these frames?",
+        )
+    if verdict.as_good:
+        others = ", or ".join(map(str, verdict.as_good))
+        notes = (f"{notes[0]}; the overlap cannot tell that from {others}",)
+    return verdict, notes
+
+
+def judge(recording: Recording) -> Verdict:
+    """Lay pairs of frames on one another, under the convention and under others."""
+    pairs = list(_pairs(recording))
+    declared = recording.convention
+    if not pairs:
+        return Verdict(float("nan"), declared, float("nan"))
+    share = _share(pairs, recording.poses, declared)
+    least = max(GOOD, share + BETTER, 2 * share)
+    others = {c: _share(pairs, recording.poses, c) for c in _others(declared, (1.0,))}
+    as_good = tuple(c for c, found in others.items() if found >= AS_GOOD * share > 0.1)
+    if share < 0.5 and max(others.values()) <= least:  # above, none could agree in twice as many
+        others = {
+            c: _share(pairs, recording.poses, c)
+            for c in _others(declared, FACTORS)
+            if _moves(pairs, recording.poses, c)
+        }
+    best = max(others, key=lambda c: others[c], default=declared)
+    if best == declared or others[best] <= least:
+        return Verdict(share, declared, share, as_good)
+    return Verdict(share, best, others[best])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    i: int
+    j: int
+    tree: object
+    """Of the points of frame i."""
+    moved: Array
+    """(n, 3), points of frame j, m."""
+    tolerance: float
+    """m."""
+    reach: float
+    """Typical distance of the points of frame i, m."""
+
+
+def _pairs(recording: Recording) -> Iterator[_Pair]:
+    """Give pairs of frames, spread over the recording, between which the camera has moved."""
+    from scipy.spatial import cKDTree
+
+    poses = recording.T_world_camera
+    if len(poses) < 2:
+        return
+    for i in sorted({round(k) for k in np.linspace(0, len(poses) - 1, PAIRS)}):
+        fixed = _points(recording, i, FIXED_POINTS)
+        if len(fixed) < 100:
+            continue
+        reach = float(np.median(np.linalg.norm(fixed, axis=1)))
+        tree = cKDTree(fixed)
+        spacing = float(np.median(tree.query(fixed[:: max(1, len(fixed) // 500)], k=2)[0][:, 1]))
+        # which are neighbours depends on which way the poses map: those of either way are tried
+        for j in sorted({_neighbour(T, i, reach) for T in (poses, se3.inverse(poses))}):
+            points = _points(recording, j, MOVED_POINTS)
+            if len(points) >= 100:
+                yield _Pair(i, j, tree, points, max(2 * spacing, TOLERANCE * reach), reach)
+
+
+def _neighbour(poses: Array, i: int, reach: float) -> int:
+    """Return the nearest of the frames that have moved enough: it sees most of the same ground."""
+    between = se3.inverse(poses[i]) @ poses
+    turned = np.linalg.norm(se3.log_so3(between[:, :3, :3]), axis=1) / TURN
+    shifted = np.linalg.norm(between[:, :3, 3], axis=1) / (SHIFT * reach)
+    moved = np.maximum(turned, shifted)
+    enough = np.nonzero(moved >= 1)[0]
+    return int(enough[np.argmin(moved[enough])] if len(enough) else np.argmax(moved))
+
+
+def _share(pairs: list[_Pair], poses: Array, convention: Convention) -> float:
+    """Return the part of the points that agree: the better of a frame's neighbours, their mean."""
+    shares: dict[int, float] = {}
+    for pair in pairs:
+        T_i, T_j = convention.applied(poses[[pair.i, pair.j]])
+        T = se3.inverse(T_i) @ T_j
+        p = pair.moved @ T[:3, :3].T + T[:3, 3]
+        found = pair.tree.query(p, distance_upper_bound=pair.tolerance)[0]  # type: ignore[attr-defined]
+        shares[pair.i] = max(shares.get(pair.i, 0.0), float(np.isfinite(found).mean()))
+    return float(np.mean(list(shares.values())))
+
+
+def _moves(pairs: list[_Pair], poses: Array, convention: Convention) -> bool:
+    """Tell whether the camera moves noticeably, though not beyond what it sees."""
+    shifts = []
+    for pair in pairs:
+        T_i, T_j = convention.applied(poses[[pair.i, pair.j]])
+        shifts.append(float(np.linalg.norm(T_i[:3, 3] - T_j[:3, 3])) / pair.reach)
+    return LEAST_SHIFT <= float(np.median(shifts)) <= 10.0
+
+
+def _others(declared: Convention, factors: tuple[float, ...]) -> Iterator[Convention]:
+    axes: tuple[Axes, ...] = ("opencv", "opengl")
+    directions: tuple[Direction, ...] = ("camera-to-world", "world-to-camera")
+    for one, way, factor in product(axes, directions, factors):
+        other = replace(declared, axes=one, direction=way, scale=declared.scale * factor)
+        if other != declared:
+            yield other
+
+
+def _options(declared: Convention, best: Convention, recording: Recording) -> str:
+    words = []
+    if best.axes != declared.axes:
+        words.append(f"--axes {best.axes}")
+    if best.direction != declared.direction:
+        words.append(f"--direction {best.direction}")
+    if best.scale != declared.scale:
+        words.append(f"--pose-scale {best.scale:g}")
+        if recording.depth_scale is not None:
+            factor = best.scale / declared.scale
+            words.append(f"(or --depth-scale {recording.depth_scale / factor:g})")
+    return " ".join(words)
+
+
+def _points(recording: Recording, k: int, most: int) -> Array:
+    """Return at most so many points (n, 3) of a frame, m."""
+    frame = recording.frames[k]
+    if frame.depth is None:
+        assert frame.cloud is not None
+        points = frame.cloud()
+        return np.asarray(points[:: max(1, len(points) // most)])
+    assert frame.camera is not None
+    z, rays = frame.depth(), frame.camera.rays()
+    if z.shape != rays.shape[:2]:
+        raise DatasetError(
+            f"{recording.path}: {frame.name}: {z.shape[1]} x {z.shape[0]} pixels, "
+            f"expected {frame.camera.width} x {frame.camera.height}"
+        )
+    step = max(1, int(np.sqrt(z.size / most)))
+    z, rays = z[step // 2 :: step, step // 2 :: step], rays[step // 2 :: step, step // 2 :: step]
+    seen = np.isfinite(z) & (z > 0) & np.isfinite(rays[..., 0])
+    return np.asarray(rays[seen] * z[seen][:, None])

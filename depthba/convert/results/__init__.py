@@ -1,0 +1,1 @@
+"""What a registration found, in files that other tools read."""
