@@ -43,6 +43,12 @@ VERBS = {
         extra="sim",
         needs=("mujoco", "embreex"),
     ),
+    "simulate-controller": Verb(
+        "sim.verbs.simulate_controller",
+        "Run a simulated UR16e, which a client of the real one can drive.",
+        extra="sim",
+        needs=("mujoco",),
+    ),
     "register": Verb(
         "depthba.verbs.register", "Estimate the poses and the depth map of a dataset."
     ),

@@ -24,5 +24,9 @@ class MissingPackage(DepthbaError):
     """An optional package is not installed: names the package and the extra that brings it."""
 
 
+class OutOfReach(DepthbaError):
+    """An arm cannot take a pose, or cannot come there on the way asked for."""
+
+
 class Cancelled(DepthbaError):
     """The caller asked to stop; nothing was returned or written."""

@@ -20,6 +20,7 @@ class Safety(Enum):
     NORMAL = "normal"
     REDUCED = "reduced"
     PROTECTIVE_STOP = "protective stop"
+    SAFEGUARD_STOP = "safeguard stop"
     EMERGENCY_STOP = "emergency stop"
     FAULT = "fault"
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 VIEW = (float(np.radians(100.0)), float(np.radians(68.0)))
 """Width and height of the ZED 2's view cone, rad."""
 
-_REACH = np.array([1.2, 1.2, 0.75, 0.4, 0.35, 0.25])
+REACH = np.array([1.2, 1.2, 0.75, 0.4, 0.35, 0.25])
 """No point of the arm or its camera is further from the joint's axis, m."""
 
 
@@ -95,12 +95,27 @@ class Clearance:
         mujoco.mj_collision(self._model, self._data)
         return self._data.ncon == 0
 
+    def nearest(self, q: Array) -> tuple[float, tuple[str, str]]:
+        """The least distance with the arm's joints at `q` (n,), m, and between what.
+
+        Below 0: how deep they are in each other. What is further away than the margin is not
+        looked at: the margin then, and two empty names.
+        """
+        self._move(q)
+        mujoco.mj_collision(self._model, self._data)
+        if self._data.ncon == 0:
+            return self.margin, ("", "")
+        contacts = self._data.contact
+        k = int(np.argmin(contacts.dist[: self._data.ncon]))
+        one, other = contacts.geom[k]
+        return float(contacts.dist[k]), (self._name(int(one)), self._name(int(other)))
+
     def path_free(self, q_from: Array, q_to: Array) -> bool:
         """Whether the straight way from joints to joints is free.
 
         It is sampled so finely that between two samples nothing gets through the margin.
         """
-        steps = int(np.ceil(np.abs(q_to - q_from) @ _REACH / (1.5 * self.margin)))
+        steps = int(np.ceil(np.abs(q_to - q_from) @ REACH / (1.5 * self.margin)))
         # From coarse to fine: a blocked way is found out early.
         shares = sorted(np.arange(1, steps) / steps, key=lambda share: (abs(share - 0.5), share))
         return all(self.free(q_from + share * (q_to - q_from)) for share in shares)
