@@ -44,6 +44,8 @@ class Capture:
     """Host clock, s since the epoch, of the middle of the exposure as nearly as it is known."""
     rgb: NDArray[np.uint8] | None = None
     """(height, width, 3) or None."""
+    T_world_camera_true: NDArray[np.float64] | None = None
+    """(4, 4), which a simulation alone knows."""
 
 
 class DepthCamera(Protocol):
