@@ -9,6 +9,7 @@ kinematics, never from the controller.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import threading
 import time
 from collections.abc import Callable
@@ -19,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from depthba import se3
 from depthba.errors import OptionError, OutOfReach
 from depthba.kinematics import UR16E, DhArm
 from depthba.straight import straight
 from depthba.ur_calibration import read_calibration
 from rig.arms.arm import ArmState, Safety
+from rig.arms.targets import check_rate, checked_joints, checked_pose
 from rig.arms.ur_link import Link, Lost, Refused
 from rig.arms.ur_preflight import Greeting, ask_dashboard, preflight, refuse_stop
 from rig.errors import ArmError, EmergencyStop, ProtectiveStop, Stopped
@@ -140,6 +141,10 @@ class UrArm:
         """See `Arm`."""
         self._drop()
         options = self.options
+        if importlib.util.find_spec("rtde_control") is None:
+            raise ArmError(
+                "ur-rtde is not installed, expected it beside us: pip install 'depthba[rig]'"
+            )
         self.greeting = preflight(options.host, options.patience)
         self._link = Link(options.host)
         try:
@@ -228,27 +233,28 @@ class UrArm:
 
     def move_joints(self, target: ArrayLike, *, speed: float, acceleration: float) -> ArmState:
         """See `Arm`."""
-        joints = self._checked_joints(target)
-        self._check_rate("speed", speed, self.options.joint_speed, "rad/s")
-        self._check_rate("acceleration", acceleration, np.inf, "rad/s^2")
+        host = self.options.host
+        joints = checked_joints(target, self._dh, host)
+        check_rate("speed", speed, self.options.joint_speed, "rad/s", host)
+        check_rate("acceleration", acceleration, np.inf, "rad/s^2", host)
         return self._go("move_joints", lambda q: joints, speed, acceleration)
 
     def move_linear(self, target: ArrayLike, *, speed: float, acceleration: float) -> ArmState:
         """See `Arm`. The joints at the end are our own; the controller is sent those."""
-        T = np.asarray(target, float)
-        if T.shape != (4, 4) or not se3.is_rigid(T):
-            raise ArmError(
-                f"{self.options.host}: target {T.tolist()}: expected a rigid, finite pose (4, 4)"
-            )
-        self._check_rate("speed", speed, self.options.tool_speed, "m/s")
-        self._check_rate("acceleration", acceleration, np.inf, "m/s^2")
+        host = self.options.host
+        T = checked_pose(target, host)
+        check_rate("speed", speed, self.options.tool_speed, "m/s", host)
+        check_rate("acceleration", acceleration, np.inf, "m/s^2", host)
 
         def end_of_line(q: Array) -> Array:
             try:
                 return straight(self._dh, q, T).joints[-1]
             except OutOfReach as error:
                 place = np.round(T[:3, 3], 3).tolist()
-                raise ArmError(f"{self.options.host}: target at {place} m: {error}") from None
+                raise ArmError(
+                    f"{host}: target at {place} m: {error}; expected a pose that the"
+                    " arm reaches in a straight line"
+                ) from None
 
         return self._go("move_line", end_of_line, speed, acceleration)
 
@@ -258,30 +264,6 @@ class UrArm:
         # A link that is lost has been ended, and the arm braked by it as well as it could be.
         with contextlib.suppress(ArmError):
             self._ask("stop", 2.0)
-
-    def _checked_joints(self, target: ArrayLike) -> Array:
-        host, dh = self.options.host, self._dh
-        try:
-            q = np.array(target, float)
-        except (TypeError, ValueError):
-            raise ArmError(f"{host}: target {target!r}: expected joints in rad") from None
-        if q.shape != (len(dh.joints),):
-            raise ArmError(
-                f"{host}: target {q.tolist()}: {q.size} numbers, expected {len(dh.joints)} joints"
-            )
-        if not np.isfinite(q).all():
-            raise ArmError(f"{host}: target {q.tolist()}: expected finite joints, rad")
-        for name, value, low, high in zip(dh.joints, q, dh.lower, dh.upper, strict=True):
-            if not low <= value <= high:
-                raise ArmError(
-                    f"{host}: target {name} {value:.4f} rad: expected {low:.4f} to {high:.4f}"
-                )
-        return q
-
-    def _check_rate(self, name: str, value: float, most: float, unit: str) -> None:
-        if not (np.isfinite(value) and 0.0 < value <= most):
-            limit = f"above 0 and at most {most:g}" if np.isfinite(most) else "above 0"
-            raise ArmError(f"{self.options.host}: {name} {value}: expected {limit} {unit}")
 
     def _go(
         self, do: str, end_of: Callable[[Array], Array], speed: float, acceleration: float
@@ -315,7 +297,7 @@ class UrArm:
                 f"{self.options.host}: robot mode {found['mode']}, expected {_RUNNING} (running):"
                 " power the robot on"
             )
-        if found["runtime"] != _PLAYING:
+        if found["runtime"] != _PLAYING or not found["obeying"]:
             if not self._remote():
                 raise ArmError(
                     f"{self.options.host}: the robot is in local mode, expected remote control"
@@ -325,7 +307,7 @@ class UrArm:
             except Refused as error:
                 raise ArmError(_explained(str(error))) from None
             end = time.monotonic() + 3.0
-            while (found := self._instant())["runtime"] != _PLAYING:
+            while not ((found := self._instant())["obeying"] and found["runtime"] == _PLAYING):
                 self._refuse_stop(found)
                 if time.monotonic() > end:
                     raise ArmError(
@@ -403,4 +385,4 @@ def _explained(said: str) -> str:
         )
     if "remote control" in lower:
         return f"{said}; expected remote control, which the teach pendant switches to"
-    return said
+    return f"{said}; expected the control script to run"

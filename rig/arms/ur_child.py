@@ -63,6 +63,8 @@ class Client:
             raise RuntimeError("no two readings of one instant")
         connected = receive.isConnected() and self._control.isConnected()
         found["connected"] = connected
+        # The two interfaces have a connection each, and need not know of a start at one time.
+        found["obeying"] = connected and self._control.isProgramRunning()
         found["busy"] = connected and (
             self._control.getAsyncOperationProgressEx().isAsyncOperationRunning()
         )
@@ -82,18 +84,15 @@ class Client:
         return True
 
     def revive(self) -> bool:
-        """Run the control script again where it was ended."""
+        """Send the control script again where it was ended; it starts a moment later."""
         return bool(self._control.reuploadScript())
 
     def leave(self) -> bool:
-        """Brake if need be, end the script, hang up."""
-        if self._control is not None and self._control.isConnected():
-            if self._control.isProgramRunning():
-                self._control.stopJ(DECELERATION)
-            self._control.stopScript()
-            self._control.disconnect()
-        if self._receive is not None:
-            self._receive.disconnect()
+        """Brake if need be and end the script; the end of the process hangs up."""
+        control = self._control
+        if control is not None and control.isConnected() and control.isProgramRunning():
+            control.stopJ(DECELERATION)
+            control.stopScript()
         return True
 
 

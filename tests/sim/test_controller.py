@@ -146,9 +146,10 @@ def test_signals_end_it_cleanly_and_its_ports_are_free_again() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         with controller(host=host) as running:
             with socket.create_connection((host, 30004), 10.0) as client:
+                client.sendall(message(protocol.VERSION, struct.pack(">H", 2)))
+                assert client.recv(16)
                 running.process.send_signal(number)
                 assert running.process.wait(30) == 0
-                client.settimeout(10.0)
                 assert client.recv(1) == b""
             with pytest.raises(SimulationError, match="expected a running"):
                 running.truth()
