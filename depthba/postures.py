@@ -1,4 +1,4 @@
-"""The ways in which an arm of the UR kind can take a pose from above: its joints, from good starts."""
+"""The joints with which an arm of the UR kind takes a pose, found from good starts."""
 
 from __future__ import annotations
 

@@ -36,7 +36,9 @@ class Owner:
         self._camera = make(kind, values)
         found = self._camera.open()
         # A camera may bring classes of its own: the other side knows ours.
-        return CameraInfo(**{name: getattr(found, name) for name in CameraInfo.__dataclass_fields__})
+        return CameraInfo(
+            **{name: getattr(found, name) for name in CameraInfo.__dataclass_fields__}
+        )
 
     def capture(self, timeout: float) -> Capture:
         """One frame."""

@@ -1,1 +1,1 @@
-"""Capture sessions: from a file that says what to capture to a dataset that nothing is lost from."""
+"""Capture sessions: from a file that says what to capture to a dataset, losing nothing."""

@@ -44,11 +44,7 @@ def grid_poses(grid: Grid) -> Array:
     """T_world_camera (N, 4, 4), row by row, every other row back."""
     xs, ys = _spread(*grid.x, grid.counts[0]), _spread(*grid.y, grid.counts[1])
     gaze = np.array(
-        [
-            (x, y, grid.z)
-            for row, y in enumerate(ys)
-            for x in (xs if row % 2 == 0 else xs[::-1])
-        ]
+        [(x, y, grid.z) for row, y in enumerate(ys) for x in (xs if row % 2 == 0 else xs[::-1])]
     )
     n = np.arange(len(gaze))
     side, tilt = _GOLDEN * n, np.radians(grid.tilt_deg)
@@ -79,7 +75,7 @@ def dome_poses(dome: Dome) -> Array:
 def step_positions(steps: Steps) -> Array:
     """Positions (N, axes), m; the first axis runs to and fro."""
     lines = [_spread(*ends) for ends in zip(steps.first, steps.last, steps.counts, strict=True)]
-    positions = [()]
+    positions: list[tuple[float, ...]] = [()]
     for line in reversed(lines):
         positions = [
             (value, *rest)
@@ -89,7 +85,7 @@ def step_positions(steps: Steps) -> Array:
     return np.array(positions)
 
 
-def _swinging(degrees: float, n: Array) -> Array:
+def _swinging(degrees: float, n: NDArray[np.int64]) -> Array:
     """0, to the one side, 0, to the other side, and so on, rad."""
     return np.radians(degrees) * np.array([0.0, 1.0, 0.0, -1.0])[n % 4]
 

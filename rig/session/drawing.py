@@ -51,8 +51,8 @@ def draw_plan(plan: Plan, space: Workspace, info: CameraInfo, start: Array, path
         )
         recording.log(at, pose, static=True)
         recording.log(f"{at}/view", view, static=True)
-        name = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.003, colors=_POSES, labels=f"{k}: {label}")
-        recording.log(f"{at}/name", name, static=True)
+        marked = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.003, colors=_POSES, labels=f"{k}: {label}")
+        recording.log(f"{at}/name", marked, static=True)
     way = rr.LineStrips3D([_way(plan, space, start)], colors=_WAY, radii=-1.0)
     recording.log("way", way, static=True)
     for name, box in (("camera", space.limits.camera), ("flange", space.limits.flange)):

@@ -63,9 +63,7 @@ class _Reader:
         try:
             return self._fitted(node, hint, key)
         except _Misfit:
-            raise self.fail(
-                node, key, f"is {_shown(node)}, expected {_expected(hint)}"
-            ) from None
+            raise self.fail(node, key, f"is {_shown(node)}, expected {_expected(hint)}") from None
 
     def _fitted(self, node: yaml.Node, hint: Any, key: str) -> Any:
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -79,7 +77,11 @@ class _Reader:
             return self._tuple(node, arguments, key)
         if isinstance(node, yaml.ScalarNode):
             return _scalar(_plain(node), hint, self._path.parent)
-        if hint is Any or origin in (dict, Mapping) or origin is typing.get_origin(Mapping[str, Any]):
+        if (
+            hint is Any
+            or origin in (dict, Mapping)
+            or origin is typing.get_origin(Mapping[str, Any])
+        ):
             if hint is not Any and not isinstance(node, yaml.MappingNode):
                 raise _Misfit
             return _plain(node)
@@ -126,9 +128,7 @@ class _Reader:
         except DepthbaError as error:
             raise self.fail(node, key, str(error)) from None
 
-    def _found(
-        self, find: Callable[[Any], Any], node: yaml.Node, key: str, value: Any
-    ) -> Any:
+    def _found(self, find: Callable[[Any], Any], node: yaml.Node, key: str, value: Any) -> Any:
         try:
             return find(value)
         except DepthbaError as error:

@@ -113,5 +113,3 @@ def _refuse_full_disk(out: Path, info: CameraInfo, frames: int, colour: bool) ->
         raise DatasetError(
             f"{there}: {free / 1e6:.0f} MB free, expected {need / 1e6:.0f} MB for {frames} frames"
         )
-
-

@@ -91,8 +91,11 @@ class CameraChoice:
 
 @dataclass(frozen=True)
 class Look:
-    """A camera pose by where it stands and what it looks at; the image's x lies along the world's
-    as nearly as can be without turning about the view."""
+    """A camera pose by where it stands and what it looks at.
+
+    The image's x lies as it does when the camera looks straight down and is then turned the
+    shortest way.
+    """
 
     at: Point
     """World, m."""
@@ -190,7 +193,9 @@ class Steps:
     def __post_init__(self) -> None:
         """OptionError: the three do not belong together."""
         if not len(self.first) == len(self.last) == len(self.counts):
-            raise OptionError("first, last and counts: expected an entry for each axis in all three")
+            raise OptionError(
+                "first, last and counts: expected an entry for each axis in all three"
+            )
         if not self.counts or min(self.counts) < 1:
             raise OptionError(f"counts {list(self.counts)}: expected 1 or more each")
 

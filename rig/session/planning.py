@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,10 +67,12 @@ def plan(session: Session, space: Workspace, start: Array) -> Plan:
     order = _ordered(able, choices, space, start, session.order == "given")
     taken = {k for k, _ in order}
     blocked = [
-        (wishes[k].label, _no_way(choices[k][0], order, space, start)) for k in able if k not in taken
+        (wishes[k].label, _no_way(choices[k][0], order, space, start))
+        for k in able
+        if k not in taken
     ]
     refused += blocked
-    if blocked and session.unreachable == "refuse" or not order:
+    if (blocked and session.unreachable == "refuse") or not order:
         raise OutOfReach(_listed(refused, len(wishes)))
     if session.order == "shortest":
         order = _shortened(order, space, start)
@@ -203,8 +206,10 @@ def _ordered(
 def _shortened(
     order: list[tuple[int, Array]], space: Workspace, start: Array
 ) -> list[tuple[int, Array]]:
-    """The order with stretches of it turned round as long as that shortens the way (2-opt, Croes
-    1958); the joints stay."""
+    """The order with stretches of it turned round as long as that shortens the way.
+
+    2-opt (Croes 1958); the joints stay.
+    """
     order = list(order)
     q = np.array([start, *(q for _, q in order)])
     n = len(order)
@@ -221,7 +226,7 @@ def _shortened(
                     continue
                 turned = q[i + 1 : j + 1][::-1]
                 legs = [q[i], *turned, *([q[j + 1]] if j < n else [])]
-                pairs = zip(legs[:-1], legs[1:], strict=True)
+                pairs = itertools.pairwise(legs)
                 if any(space.way(a, b)[1] is not None for a, b in pairs):
                     continue
                 q[i + 1 : j + 1] = turned.copy()
@@ -233,9 +238,7 @@ def _shortened(
     return order
 
 
-def _no_way(
-    q: Array, order: list[tuple[int, Array]], space: Workspace, start: Array
-) -> str:
+def _no_way(q: Array, order: list[tuple[int, Array]], space: Workspace, start: Array) -> str:
     here = order[-1][1] if order else start
     reason = space.way(here, q)[1] or "the way there leaves the limits"
     where = "where the rig stands" if not order else "the pose before"

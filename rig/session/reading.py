@@ -28,7 +28,8 @@ def read_session(path: str | Path) -> Session:
     session: Session = read_marked(path, Session)
     if isinstance(session.hand_eye, Path):
         T = _transform(session.hand_eye, path)
-        session = dataclasses.replace(session, hand_eye=tuple(map(tuple, T.tolist())))
+        a, b, c, d = (row for row in map(tuple, T.tolist()))
+        session = dataclasses.replace(session, hand_eye=(a, b, c, d))
     return session
 
 

@@ -1,4 +1,4 @@
-"""A rehearsal: the same session against a simulated rig, whose processes live as long as it does."""
+"""A rehearsal: the same session against a simulated rig, whose processes end with it."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ class _Process:
         environment = dict(os.environ)
         paths = [root, *filter(None, [environment.get("PYTHONPATH")])]
         environment["PYTHONPATH"] = os.pathsep.join(paths)
-        self._errors: IO[bytes] = tempfile.TemporaryFile()
-        # Ctrl-C at the terminal is for the session: the simulated robot must be there to be braked.
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        # Ctrl-C at the terminal is for the session: the robot must be there to be braked.
         self._child = subprocess.Popen(
             words,
             stdin=subprocess.DEVNULL,

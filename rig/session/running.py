@@ -245,9 +245,7 @@ class Run:
             f" most {most:g}"
         )
 
-    def _commit(
-        self, k: int, standing: Standing, T_world_camera: Array, capture: Capture
-    ) -> None:
+    def _commit(self, k: int, standing: Standing, T_world_camera: Array, capture: Capture) -> None:
         notes: dict[str, Any] = {
             "station": k,
             "label": self.plan.labels[k],

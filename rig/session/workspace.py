@@ -117,9 +117,7 @@ class Workspace:
         if reason is None:
             return (q_to,), None
         rest = self.rest
-        if rest is not None and not (
-            self.why_no_way(q_from, rest) or self.why_no_way(rest, q_to)
-        ):
+        if rest is not None and not (self.why_no_way(q_from, rest) or self.why_no_way(rest, q_to)):
             return (rest, q_to), None
         return (), reason
 
@@ -138,7 +136,9 @@ class Workspace:
     def _places(self, q: Array) -> list[tuple[str, Array, Array]]:
         """Name, places (k, 3) and box (6,) of everything that a box is given for."""
         T_world_flange = self.T_world_base @ self.body.forward(q)
-        found = [("camera", (T_world_flange @ self.T_flange_camera)[..., :3, 3], self.limits.camera)]
+        found = [
+            ("camera", (T_world_flange @ self.T_flange_camera)[..., :3, 3], self.limits.camera)
+        ]
         if self.limits.flange is not None:
             found.append(("flange", T_world_flange[..., :3, 3], self.limits.flange))
         return [(name, place, np.array(box)) for name, place, box in found]

@@ -203,7 +203,8 @@ def _live() -> Any:
         return importlib.import_module("eval.live")
     except ImportError as error:
         raise MissingPackage(
-            f"capture --live needs {error.name}, which is not installed: pip install 'depthba[eval]'"
+            f"capture --live needs {error.name}, which is not installed:"
+            " pip install 'depthba[eval]'"
         ) from error
 
 
