@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,11 @@ def plan(session: Session, space: Workspace, start: Array) -> Plan:
             can. Says of each why.
         OptionError: poses of the wrong length; a file that cannot be read.
     """
-    wishes = [wish for poses in session.poses for wish in _wishes(poses, space)]
+    wishes = [
+        replace(wish, label=f"{wish.label} of poses[{number}]") if len(session.poses) > 1 else wish
+        for number, poses in enumerate(session.poses)
+        for wish in _wishes(poses, space)
+    ]
     choices, refused = _choices(wishes, space, start)
     if refused and session.unreachable == "refuse":
         raise OutOfReach(_listed(refused, len(wishes)))
