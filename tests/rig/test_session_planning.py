@@ -128,7 +128,9 @@ def test_a_way_that_leaves_the_limits_leads_over_the_rest_or_is_refused(tmp_path
     poses = [{"joints": [left, right]}]
     session = read_session(write(tmp_path / "s.yaml", poses=poses, **limits))
     space = Workspace.of(session, make_carrier(session.rig, session.motion).body)
-    with pytest.raises(OutOfReach, match=r"1 of 2 .*joints 1: no way from the pose before: camera y"):
+    with pytest.raises(
+        OutOfReach, match=r"1 of 2 .*joints 1: no way from the pose before: camera y"
+    ):
         plan(session, space, np.array(left))
     folded = [READY[0], -1.9, 2.2, -1.87, -1.571, -0.356]
     session = dataclasses.replace(
