@@ -278,7 +278,7 @@ def test_a_dry_run_checks_all_moves_nothing_and_draws_the_plan(
         assert not drawn.exists()
     else:
         assert drawn.stat().st_size > 1000
-    beyond = changed()["limits"]["camera"][:3] + [0.5, 0.35, 0.9]
+    beyond = [*changed()["limits"]["camera"][:3], 0.5, 0.35, 0.9]
     path = session(tmp_path, robot, limits__camera=beyond)
     assert main(["capture", str(path), "--out", str(out), "--dry-run"]) == 1
     assert "3 of 3 poses cannot be taken" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Rehearsals: a session and its simulated rig in one command, killed at any moment, side by side."""
+"""Rehearsals: a session and its simulated rig in one command, killed at any moment."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_session_that_is_done_is_left_alone(
     before = but_for_stamps(out)
     # Without the rehearsal it is another rig, and refused before anything is reached.
     assert main(["capture", str(path), "--out", str(out)]) == 1
-    assert "rehearsal.scene" in capsys.readouterr().err
+    assert "rehearsal: {" in capsys.readouterr().err
     assert but_for_stamps(out) == before
 
 
