@@ -36,9 +36,8 @@ class Owner:
         self._camera = make(kind, values)
         found = self._camera.open()
         # A camera may bring classes of its own: the other side knows ours.
-        return CameraInfo(
-            **{name: getattr(found, name) for name in CameraInfo.__dataclass_fields__}
-        )
+        known = [name for name in CameraInfo.__dataclass_fields__ if hasattr(found, name)]
+        return CameraInfo(**{name: getattr(found, name) for name in known})
 
     def capture(self, timeout: float) -> Capture:
         """One frame."""

@@ -220,7 +220,12 @@ def _sensor(info: CameraInfo) -> dict[str, Any]:
             sensor[name] = getattr(info, name)
     if info.noise is not None:
         sigma_m, at_m, power = info.noise
-        sensor["noise"] = {"sigma_m": sigma_m, "at_m": at_m, "power": power}
+        sensor["noise"] = {
+            "sigma_m": sigma_m,
+            "at_m": at_m,
+            "power": power,
+            "along": info.noise_along,
+        }
     return sensor
 
 
