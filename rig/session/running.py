@@ -161,10 +161,15 @@ class Run:
             if attempt:
                 self._retries += 1
                 self._say(f"{label}: {reason}; once more")
-            reason_or_none = self._frame(k)
-            if reason_or_none is None:
+            try:
+                found = self._frame(k)
+            except Stopped as stop:
+                self._await_release(stop)
+                self._go(self.plan.joints[k])
+                found = f"a safety stop came up: {stop}"
+            if found is None:
                 return None
-            reason = reason_or_none
+            reason = found
         return reason
 
     def _go(self, target: Array) -> None:
@@ -173,6 +178,7 @@ class Run:
             try:
                 here = self.carrier.state().joints
                 legs, reason = self.space.way(here, target)
+                reason = self.space.why_not(target) or reason
                 if reason is not None:
                     raise RigError(
                         f"{self.carrier.who}: no way from where the rig stands to the next pose:"

@@ -21,6 +21,10 @@ import pytest
 from depthba.cli import main
 from depthba.dataset import Dataset, verify
 from rig.cameras import names
+from rig.session.opening import opened
+from rig.session.reading import read_session
+from rig.session.record import begin
+from rig.session.running import Listeners, Run
 from tests.rig.peers import LONGEST
 from tests.rig.sessions import STATIONS, changed, command, finished, frames, write
 from tests.sim.controllers import BOXED, READY, Running, controller
@@ -32,8 +36,8 @@ if "simulated" not in names():
         pytrace=False,
     )
 
-# Each move takes more than a second: time enough to hit it.
-SLOW = {"motion__speed": 0.1, "motion__settle": 0.1, "retries": 1, "give_up": 2}
+# Each move takes most of a second: time enough to hit it.
+SLOW = {"motion__speed": 0.15, "motion__settle": 0.1, "retries": 1, "give_up": 2}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +78,7 @@ def when(happens: Callable[[], bool], do: Callable[[], None]) -> Iterator[Moment
     moment, over = Moment(), threading.Event()
 
     def watch() -> None:
-        while not over.wait(0.01):
+        while not over.wait(0.03):
             if happens():
                 moment.at = time.monotonic()
                 do()
@@ -133,13 +137,42 @@ def test_a_fault_on_the_way_ends_the_session_which_then_goes_on(
     assert "ended with 1 of 3 frames whole" in error and "the same command goes on" in error
     whole(out, 1)
     if fault == "protective-stop":
-        # Still held: refused at once. Released: gone on with, from where it was.
+        # Still held: refused at once.
         assert main(words) == 1
         assert "protective stop" in capsys.readouterr().err
-        robot.fault(fault, False)
-        assert main(words) == 0
-        whole(out, 3)
-        assert [line["station"] for line in frames(out)] == [0, 1, 2]
+
+
+def test_where_somebody_can_be_asked_a_stop_pauses_the_session(
+    tmp_path: Path, robot: Running
+) -> None:
+    out, asked = tmp_path / "out", []
+
+    def ask(question: str) -> bool:
+        asked.append(question)
+        if len(asked) == 2:
+            robot.fault("protective-stop", False)
+        return True
+
+    loaded = read_session(session(tmp_path, robot, **SLOW))
+    with opened(loaded, loaded, out, rehearsed=False, move=True) as ready:
+        writer = begin(out, loaded, ready.space, ready.plan, ready.info, False)
+        run = Run(
+            loaded,
+            ready.space,
+            ready.plan,
+            ready.carrier,
+            ready.camera,
+            ready.info,
+            writer,
+            Listeners(ask=ask),
+        )
+        with when(on_the_way(out, robot), lambda: robot.fault("protective-stop")):
+            summary = run()
+    # Asked while it was held still, and again; then it went on from where it stood.
+    assert len(asked) == 2 and all("protective stop" in question for question in asked)
+    assert summary.complete and summary.stops == 1
+    whole(out, 3)
+    assert [line["station"] for line in frames(out)] == [0, 1, 2]
 
 
 def test_a_controller_that_is_gone_ends_the_session(
@@ -187,7 +220,7 @@ def test_a_camera_that_stays_blind_ends_the_session(
     tmp_path: Path, robot: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    path = session(tmp_path, robot, **{**SLOW, "motion__speed": 1.0})
+    path = session(tmp_path, robot, **{**SLOW, "motion__speed": 1.0, "camera__timeout": 0.25})
     with when(on_the_way(out, robot), lambda: robot.fault("blind")) as moment:
         status = main(["capture", str(path), "--out", str(out)])
     took = time.monotonic() - moment.at
