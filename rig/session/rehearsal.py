@@ -25,6 +25,8 @@ from rig.session.options import Session, plain
 
 START = 90.0
 """For a simulated controller to be ready, s."""
+_PATIENCE = 10.0
+"""How long a simulated rig may say nothing at least, s."""
 _TRIES = 5
 """Addresses that are tried where others have taken one."""
 
@@ -62,11 +64,17 @@ def _simulated(session: Session, host: str, speed: float) -> Session:
     if session.camera.kind == "simulated":
         values = plain(session.camera.options)
     options = from_plain(find("simulated").Options, values | {"host": host}, "camera 'simulated'")
+    # The simulated rig shares this machine with everything else, and may have to wait for its turn.
+    reached = dataclasses.replace(
+        session.rig.options,
+        host=host,
+        patience=max(session.rig.options.patience, _PATIENCE),
+        silence=max(session.rig.options.silence, _PATIENCE),
+        standstill=max(session.rig.options.standstill, _PATIENCE),
+    )
     return dataclasses.replace(
         session,
-        rig=dataclasses.replace(
-            session.rig, options=dataclasses.replace(session.rig.options, host=host)
-        ),
+        rig=dataclasses.replace(session.rig, options=reached),
         camera=dataclasses.replace(session.camera, kind="simulated", options=options),
         motion=dataclasses.replace(session.motion, settle=session.motion.settle / speed),
     )
