@@ -49,6 +49,11 @@ VERBS = {
         extra="sim",
         needs=("mujoco",),
     ),
+    "capture": Verb(
+        "rig.verbs.capture",
+        "Run a capture session on a rig, or rehearse it without one.",
+        extra="rig",
+    ),
     "register": Verb(
         "depthba.verbs.register", "Estimate the poses and the depth map of a dataset."
     ),

@@ -26,6 +26,8 @@ from depthba.dataset.sensor import Sensor
 from depthba.errors import DatasetError
 from depthba.trajectory import tum_line
 
+_OWN_KEYS = {"id", "stamp", "depth", "rgb", "cloud", "sha256", "joints", "T_base_flange"}
+
 POSE_COMMENT = "# T_world_camera: stamp tx ty tz qx qy qz qw"
 
 
@@ -121,12 +123,14 @@ class DatasetWriter:
         T_world_camera_true: ArrayLike | None = None,
         joints: ArrayLike | None = None,
         T_base_flange: ArrayLike | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> int:
         """Commit one frame and return its id; it is on disk when this returns.
 
         Give ``depth`` (height, width), metres, NaN or 0 where nothing was measured, with ``rgb``
         (height, width, 3) uint8 if there is one; or ``cloud`` (n, 3), metres, in the sensor frame,
         of which rows with NaN are left out. Poses are (4, 4). Truth comes with all frames or none.
+        ``notes`` are further keys of the frame's line, of JSON values, which `Frame.record` gives.
 
         Raises `DatasetError` for what could not be read back, before anything is written; and where
         the disk fails, after which only `resume` goes on.
@@ -147,7 +151,9 @@ class DatasetWriter:
                 )
             record: dict[str, Any] = {"id": frame, "stamp": stamp}
             files = self._encode(depth, cloud, rgb)
-            more: dict[str, Any] = {}
+            more: dict[str, Any] = dict(notes or {})
+            if taken := sorted(_OWN_KEYS & more.keys()):
+                raise MalformedError(f"notes has the key {taken[0]!r}, which the format has itself")
             if joints is not None:
                 values = np.asarray(joints, dtype=np.float64).tolist()
                 more["joints"] = list(fields.numbers(values, "joints"))

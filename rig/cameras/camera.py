@@ -7,7 +7,7 @@ A user adds one with a class like this and an entry point of the group ``depthba
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class CameraInfo:
     """What the camera can measure, m; None: not known."""
     noise: tuple[float, float, float] | None = None
     """sigma_m, at_m and power of the range's standard deviation; None: not known."""
+    noise_along: Literal["range", "z"] = "range"
+    """Whether that deviation is along the ray or along z, as dataset.json's sensor says it."""
     settings: dict[str, str | float | bool] = field(default_factory=dict)
     """What the camera was set to, for the dataset's record."""
 
@@ -44,6 +46,8 @@ class Capture:
     """Host clock, s since the epoch, of the middle of the exposure as nearly as it is known."""
     rgb: NDArray[np.uint8] | None = None
     """(height, width, 3) or None."""
+    T_world_camera_true: NDArray[np.float64] | None = None
+    """(4, 4), which a simulation alone knows."""
 
 
 class DepthCamera(Protocol):

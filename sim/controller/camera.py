@@ -50,6 +50,8 @@ class SimulatedInfo:
     """What it can measure, m."""
     noise: tuple[float, float, float] | None
     """sigma_m, at_m and power of the standard deviation; None: it has none."""
+    noise_along: str = "range"
+    """Whether that is of the range or of z."""
     settings: dict[str, str | float | bool] = field(default_factory=dict)
 
 
@@ -165,6 +167,7 @@ class SimulatedCamera:
             depth_min=sensor.depth_min,
             depth_max=sensor.depth_max,
             noise=None if noise is None else (noise.sigma_m, noise.at_m, noise.power),
+            noise_along="range" if noise is None else noise.along,
             settings={"scene": entry.id, "seed": self._seed, "clean": self._clean},
         )
 

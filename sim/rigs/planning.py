@@ -11,26 +11,13 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.kinematics import UR16E, DhArm
+from depthba.postures import ROOM, SINGULAR, postures, turned_towards
 from sim.engine import mujoco
 from sim.errors import SimulationError
 from sim.rigs.clearance import VIEW, Clearance
 from sim.robots.ur16e import T_FLANGE_CAMERA
 
 Array = NDArray[np.float64]
-
-_MANIPULABILITY = 0.06
-"""Least singular value of the Jacobian at a pose; typical is 0.2, at a singularity 0."""
-
-_ROOM = 0.1
-"""What stays between a joint and its limits, rad."""
-
-_STARTS = (
-    (-3.5, -1.58, 1.42, -1.41, -1.57, 0.0),
-    (0.36, -1.56, -1.42, -1.73, 1.57, 0.0),
-    (-3.5, -1.01, 0.65, 1.94, 1.57, 0.0),
-    (0.36, -2.13, -0.65, 1.20, -1.57, 0.0),
-)
-"""Where the search for joints begins: elbow up, tool down; pan is added to the goal's azimuth."""
 
 _BATCH = 8
 """Alternatives whose joints are searched for together."""
@@ -134,7 +121,8 @@ class _Search:
     def _take_first(self, T_world_camera: Array) -> bool:
         """Take the first of a batch (m, 4, 4) that can be had; False: none."""
         T_base_flange = self._T_base_world @ T_world_camera @ self._T_camera_flange
-        q, right = self._solutions(T_base_flange)
+        last = self.taken[-1] if self.taken else None
+        q, right = postures(self._arm, T_base_flange, last)
         for k in range(len(T_world_camera)):
             self.tried += 1
             reason = self._take(q[k][right[k]], T_world_camera[k])
@@ -143,30 +131,16 @@ class _Search:
             self._failed[reason] += 1
         return False
 
-    def _solutions(self, T_base_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Joints (m, k, n) from k starts for each pose (m, 4, 4), and which are right."""
-        starts = np.repeat(np.array(_STARTS)[None], len(T_base_flange), axis=0)
-        starts[..., 0] += np.arctan2(T_base_flange[:, 1, 3], T_base_flange[:, 0, 3])[:, None]
-        starts[..., 0] = (starts[..., 0] + np.pi) % (2.0 * np.pi) - np.pi
-        # The last joint turns about the goal's z: what is left of the rotation about it.
-        R_start = self._arm.forward(starts)[..., :3, :3]
-        R = np.swapaxes(R_start, -1, -2) @ T_base_flange[:, None, :3, :3]
-        starts[..., -1] = np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])
-        if self.taken:
-            last = np.broadcast_to(self.taken[-1], (len(starts), 1, starts.shape[-1]))
-            starts = np.concatenate([last, starts], axis=1)
-        return self._arm.solve(T_base_flange[:, None], starts, tolerance=1e-10, steps=25)
-
     def _take(self, q: Array, T_world_camera: Array) -> str | None:
         """Take one of the solutions (k, n), the nearest if any; else the furthest they came."""
         before = self.taken[-1] if self.taken else None
         if before is not None:
-            q = self._arm.unwound(_turned_towards(q, before))
-        low, high = np.add(self._arm.lower, _ROOM), np.subtract(self._arm.upper, _ROOM)
+            q = self._arm.unwound(turned_towards(q, before))
+        low, high = np.add(self._arm.lower, ROOM), np.subtract(self._arm.upper, ROOM)
         q = q[((q >= low) & (q <= high)).all(axis=-1)]
         if len(q) == 0:
             return _REASONS[0]
-        q = q[self._arm.manipulability(q) >= _MANIPULABILITY]
+        q = q[self._arm.manipulability(q) >= SINGULAR]
         if len(q) == 0:
             return _REASONS[1]
         stage = 2
@@ -182,12 +156,6 @@ class _Search:
             self.taken.append(one)
             return None
         return (*_REASONS, _PATH)[stage]
-
-
-def _turned_towards(q: Array, before: Array) -> Array:
-    """Joints (k, n) by full turns as near to `before` (n,) as they come."""
-    turn = 2.0 * np.pi
-    return np.asarray(q - turn * np.round((q - before) / turn))
 
 
 def _by_distance(q: Array, before: Array | None) -> Iterator[Array]:

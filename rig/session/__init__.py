@@ -1,0 +1,1 @@
+"""Capture sessions: from a file that says what to capture to a dataset, losing nothing."""
