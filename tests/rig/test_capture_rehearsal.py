@@ -167,7 +167,8 @@ def test_from_a_hand_eye_transform_that_is_wrong_the_dataset_registers(tmp_path:
     import yaml
 
     content = yaml.safe_load((ROOT / "docs" / "sessions" / "simulated.yaml").read_text())
-    content["camera"]["options"]["size"] = [320, 180]
+    taught = ROOT / "docs" / "sessions" / "lab_1.txt"
+    content["poses"][0]["taught"]["file"] = str(taught)
     path, out, run = tmp_path / "s.yaml", tmp_path / "out", tmp_path / "run"
     path.write_text(yaml.safe_dump(content))
     status, _, error = finished(command(path, "--out", out, *SPEED))
@@ -182,4 +183,4 @@ def test_from_a_hand_eye_transform_that_is_wrong_the_dataset_registers(tmp_path:
     metrics = json.loads((run / "metrics.json").read_text())
     for name in ("translation_mae", "rotation_mae"):
         before, after = metrics["start"][name]["value"], metrics["metrics"][name]["value"]
-        assert after < 0.4 * before, (name, before, after)
+        assert after < 0.5 * before, (name, before, after)
