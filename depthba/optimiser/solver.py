@@ -204,7 +204,7 @@ def solve_level(
                 problem, grid, candidate, after, loss, smooth, workers, judge
             )
             after_cost = after.judged + aside
-        for share in SHORTER:
+        for share in SHORTER if rules.robust else ():
             if after_cost <= most:
                 break
             # damping shortens the poses' part alone; what the map does may be what goes too far
@@ -215,7 +215,8 @@ def solve_level(
             after_cost = after.judged + aside
         # points that change cells or fall off edges make the cost rough on a small scale: what the
         # last steps gained may be spent on getting over that (Grippo, Lampariello & Lucidi 1986)
-        accepted = after_cost <= max(most, before_cost * min(gained, LEAP))
+        leap = min(gained, LEAP) if rules.robust else 0.0
+        accepted = after_cost <= max(most, before_cost * leap)
         if accepted:
             recent = [*recent, after_cost / before_cost][-MEMORY:]
             gained = 1 / float(np.prod(recent))
