@@ -235,11 +235,21 @@ class Engine:
             level.problem, level.grid, state, level.loss, level.smooth, self.workers, 1, NEAR
         )
 
+    @property
+    def _patches_vouch(self) -> bool:
+        """Whether patches may speak: not where noise in slopes is much of what is known.
+
+        Their slopes are noisy too, and nothing takes that off: they would slide frames along a bare
+        table. Without measured poses there is nothing else to go by.
+        """
+        guarded = self.preset.prior and self.noisy >= NOISY
+        return self.preset.robust > 0 and not guarded
+
     def _tied(
         self, poses: NDArray[np.float64], spacing: float, known: certainty.Correlation | None
     ) -> NDArray[np.float64]:
         """Return the poses as patches alone would have them."""
-        if not self.preset.robust or self.clock.over:
+        if not self._patches_vouch or self.clock.over:
             return poses
         poses = tied_by_patches(
             self.problem, poses, spacing, self.prior, self.acting,
@@ -250,8 +260,8 @@ class Engine:
 
     def _patched(self, level: Level, state: State, lin: Linearisation) -> Level:
         """Return the level with patches laid anew over what its map cannot hold."""
-        if not self.preset.robust:
-            return level
+        if not self._patches_vouch:
+            return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
             robust_sigma(lin.residuals), self.workers,
