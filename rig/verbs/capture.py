@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -60,6 +61,9 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Check, capture, say how it went; return the exit status."""
+    # started in the background of a script it would be deaf to Ctrl-C, which brakes the rig
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     from rig.session.opening import opened
     from rig.session.reading import read_session
 
