@@ -163,10 +163,8 @@ class Engine:
             if last:
                 if level.tied:
                     # where the poses have got to, patches lie better
-                    level = self._patched(level, state, lin)
-                    near = reduced.reduce(lin, self.workers, NEAR, self.free)
-                    temperature, outcome = self._descend(
-                        level, state, lin, near, phase, index, len(levels), known, True
+                    level, temperature, outcome = self._last(
+                        level, state, lin, phase, index, len(levels), known
                     )
                 break
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
@@ -194,13 +192,23 @@ class Engine:
                 level, state, lin = self._lay(
                     finer, state.T_map_camera, Map(state.heights, level.grid), True
                 )
-            level = self._patched(level, state, lin)
-            near = reduced.reduce(lin, self.workers, NEAR, self.free)
-            temperature, outcome = self._descend(
-                level, state, lin, near, phase, index, index + 1, known, True
+            level, temperature, outcome = self._last(
+                level, state, lin, phase, index, index + 1, known
             )
             self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature)
+
+    def _last(
+        self, level: Level, state: State, lin: Linearisation, phase: str, index: int, levels: int,
+        known: certainty.Correlation | None,
+    ) -> tuple[Level, float, Outcome]:  # fmt: skip
+        """Lay patches anew and settle on them; return the level, the priors' weight, the end."""
+        level = self._patched(level, state, lin)
+        near = reduced.reduce(lin, self.workers, NEAR, self.free)
+        temperature, outcome = self._descend(
+            level, state, lin, near, phase, index, levels, known, True
+        )
+        return level, temperature, outcome
 
     def _bent(self, there: Known, sigma: float) -> bool:
         """Whether the camera's fixed pattern calls for steps that are worth taking."""
@@ -297,6 +305,10 @@ class Engine:
             problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
         lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
         at = reduced.reduce(lin, self.workers, free=self.free)
+        if level.tied:
+            # what groups of points say is told from surfaces that fit
+            tied = level.tied.patches.fitted(state.T_map_camera, self.workers)
+            level = replace(level, tied=tied)
         at = self._with_patches(level, state, lin, at)
         believed = self._believed(problem, level.grid, state, loss, lin, at)
         found = certainty.correlation(
