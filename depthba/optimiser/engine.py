@@ -244,11 +244,12 @@ class Engine:
         )
 
     @property
-    def _patches_vouch(self) -> bool:
-        """Whether patches may speak: not where noise in slopes is much of what is known.
+    def _details_vouch(self) -> bool:
+        """Whether patches and the camera's pattern may speak.
 
-        Their slopes are noisy too, and nothing takes that off: they would slide frames along a bare
-        table. Without measured poses there is nothing else to go by.
+        Not where noise in slopes is much of what is known: nothing takes that off what they say, and
+        either of them would slide frames along a bare table. Without measured poses there is
+        nothing else to go by.
         """
         guarded = self.preset.prior and self.noisy >= NOISY
         return self.preset.robust > 0 and not guarded
@@ -257,7 +258,7 @@ class Engine:
         self, poses: NDArray[np.float64], spacing: float, known: certainty.Correlation | None
     ) -> NDArray[np.float64]:
         """Return the poses as patches alone would have them."""
-        if not self._patches_vouch or self.clock.over:
+        if not self._details_vouch or self.clock.over:
             return poses
         poses = tied_by_patches(
             self.problem, poses, spacing, self.prior, self.acting,
@@ -268,7 +269,7 @@ class Engine:
 
     def _patched(self, level: Level, state: State, lin: Linearisation) -> Level:
         """Return the level with patches laid anew over what its map cannot hold."""
-        if not self._patches_vouch:
+        if not self._details_vouch:
             return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
@@ -324,6 +325,8 @@ class Engine:
     ) -> pattern.Believed | None:  # fmt: skip
         """Return what the points say of the camera's fixed pattern; None: there is none."""
         if self.plain or not self.preset.pattern or problem.waves is None or not self.free.any():
+            return None
+        if self.bend is None and not self._details_vouch:
             return None
         now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
         variance = robust_sigma(lin.residuals) ** 2
