@@ -127,6 +127,9 @@ class Result:
     fixed_pattern: float = 0.0
     """Error of the range that all frames share, m: root mean square over the image, at a point of
     typical noise. It was found along with the poses and taken off; 0: there is none."""
+    refused_pattern: float = 0.0
+    """The same of one that was left in: too large for the noise that the sensor states, and without
+    it the residuals hung together no less. Wrong intrinsics mimic one. 0: there was none such."""
 
     @property
     def trusted(self) -> bool:

@@ -214,6 +214,7 @@ def summary(result: Result, options: Options, dataset: Dataset) -> dict[str, Any
         "sigma": result.sigma,
         "inflation": result.inflation,
         "fixed_pattern": result.fixed_pattern,
+        "refused_pattern": result.refused_pattern,
         "dataset": {
             "path": str(Path(dataset.path).resolve()),
             "name": dataset.name,

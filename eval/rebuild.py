@@ -82,6 +82,7 @@ def archived_result(run: Run, dataset: Dataset) -> Result:
             sigma=_number(told["sigma"]),
             inflation=_number(told["inflation"]),
             fixed_pattern=_number(told.get("fixed_pattern", 0.0)),
+            refused_pattern=_number(told.get("refused_pattern", 0.0)),
             history=(),
             weak=tuple(_weak(w) for w in told["weak"]),
             frames=tuple(FrameReport(**f) for f in told["frames"]),

@@ -299,6 +299,8 @@ def _facts(judged: Evaluation) -> str:
     )
     if run.get("fixed_pattern"):
         noise += f"; fixed pattern of the camera {_mm(run['fixed_pattern'])} rms, taken off"
+    if run.get("refused_pattern"):
+        noise += f"; a pattern of {_mm(run['refused_pattern'])} rms would fit: too much, left in"
     rows = [
         ["Dataset", f"{judged.dataset.name}, {len(judged.run.stamps)} frames"],
         ["Preset", str(options.get("preset"))],

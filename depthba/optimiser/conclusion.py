@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.optimiser import certainty
+from depthba.optimiser.ending import Known, known_at
 from depthba.optimiser.engine import End, Engine
 from depthba.optimiser.grid import average, filled
 from depthba.optimiser.linearise import State, linearise
@@ -22,6 +23,7 @@ ROUNDS, TOLERANCE = 3, 1e-3
 def conclude(
     engine: Engine,
     end: End,
+    known: Known | None,
     ids: tuple[int, ...],
     stamps: tuple[float, ...],
     start: NDArray[np.float64],
@@ -33,6 +35,7 @@ def conclude(
     Args:
         engine: that ran the levels.
         end: where they ended.
+        known: what is known there, if that was found out.
         ids: of the frames.
         stamps: of the frames, s.
         start: (N, 4, 4) T_world_camera.
@@ -58,19 +61,19 @@ def conclude(
     better = cost_end <= cost_start
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")
-    found = end.known if better else None
-    found = found or engine.known_at(level, state, outcome.loss)
-    firm, firm_lin, known = found.problem, found.lin, found.correlation
+    found = known if better else None
+    found = found or known_at(engine, level, state, outcome.loss)
+    firm, firm_lin, correlation = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
-    variance, inflation = known.inflation * sigma**2, max(known.inflation, known.overall)
+    variance, inflation = correlation.inflation * sigma**2, found.inflation
     held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
     S, _ = without_slope_noise(
-        firm, level.grid, state, outcome.loss, firm_lin, known.S, variance * held_by_prior,
+        firm, level.grid, state, outcome.loss, firm_lin, correlation.S, variance * held_by_prior,
         engine.free, workers, sigma,
     )  # fmt: skip
     judged = certainty.assess(
         level.problem, state, firm_lin, S, inflation * sigma**2, prior, engine.preset.prior,
-        engine.free, ids, known,
+        engine.free, ids, correlation,
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
@@ -94,4 +97,5 @@ def conclude(
         seconds={**engine.clock.stages, "total": engine.clock.elapsed},
         overlap=overlap,
         fixed_pattern=engine.fixed_pattern,
+        refused_pattern=engine.refused_pattern,
     )

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import certainty, pattern, reduced, schedule
-from depthba.optimiser.bends import without_bends
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level, level_heights, make_level
-from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
+from depthba.optimiser.linearise import Linearisation, State, robust_sigma
 from depthba.optimiser.prior import PosePrior
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
@@ -46,12 +44,6 @@ NOISY = 0.1
 FINER = 4.0
 # A spacing below this share of the last one is worth a level of its own.
 CLEARLY = 0.9
-# Times that the last level goes on when the residuals turn out less correlated than was thought.
-AGAIN = 4
-# It goes on when their inflation has come out below this share of what was believed.
-LESS = 0.8
-# It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
-BENT = 0.3
 
 
 @dataclass(frozen=True)
@@ -63,18 +55,6 @@ class Map:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What the points say at a state, but for those that must not vouch for it."""
-
-    problem: Problem
-    """Without the points at sharp bends."""
-    lin: Linearisation
-    correlation: certainty.Correlation
-    believed: pattern.Believed | None = None
-    """The fixed pattern of the camera; None: there is none."""
-
-
-@dataclass(frozen=True)
 class End:
     """Where the last level ended, and what is known there."""
 
@@ -82,8 +62,10 @@ class End:
     outcome: Outcome
     temperature: float
     """m^2, what a squared normalised error of a measured pose cost."""
-    known: Known | None = None
-    """What the points say there, if that was found out."""
+    index: int
+    """Of the level, from the coarsest."""
+    believed: float
+    """Factor on the variance of what the points say that was reckoned with."""
 
 
 @dataclass
@@ -107,6 +89,8 @@ class Engine:
     """(m,), m at a point of typical noise: what has been taken off the points; None: nothing."""
     plain: bool = False
     """Whether the camera was found to have no fixed pattern: it is not looked for again."""
+    refused_pattern: float = 0.0
+    """Root mean square over the image, m, of one that was too large to be the camera's; else 0."""
 
     @property
     def preset(self) -> schedule.Preset:
@@ -131,22 +115,20 @@ class Engine:
         levels: list[float],
         poses: NDArray[np.float64],
         refining: bool = False,
-        judged: bool = True,
     ) -> End:
         """Run levels of the given spacings, m, from poses (N, 4, 4) ``T_map_camera``.
 
         ``refining``: the poses are near the solution, so that no level needs the wide loss first.
-        ``judged``: what is known at the end is found out, and the last level goes on where it asks
-        for that.
         """
         before: Map | None = None
         known: certainty.Correlation | None = None
         levels = list(levels)
-        for index in count():
+        index = 0
+        while True:
             last = index == len(levels) - 1 or self.clock.over
             if last and index:
                 poses = self._tied(poses, levels[index], known)
-            level, state, lin = self._lay(levels[index], poses, before, last)
+            level, state, lin = self.lay(levels[index], poses, before, last)
             for phase in phases(1 if refining else index, self.preset):
                 if last and phase == phases(1, self.preset)[-1]:
                     level = self._patched(level, state, lin)
@@ -163,63 +145,27 @@ class Engine:
             if last:
                 if level.tied:
                     # where the poses have got to, patches lie better
-                    level, temperature, outcome = self._last(
-                        level, state, lin, phase, index, len(levels), known
-                    )
-                break
+                    return self.settle(level, state, lin, index, known)
+                return End(level, outcome, temperature, index, believed)
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
             if known and self.options.resolution is None:
                 levels, known = self._no_finer(levels, index, level, outcome, known)
-        if not judged:
-            return End(level, outcome, temperature)
-        for _ in range(AGAIN):
-            there = self.known_at(level, outcome.state, outcome.loss)
-            known = there.correlation
-            finer = self._finer(level.grid.spacing, known, outcome)
-            less = known.inflation < LESS * believed
-            bent = self._bent(there, outcome.sigma)
-            # a pattern may be what keeps the poses from settling
-            more = bent or (outcome.converged and (less or finer < level.grid.spacing))
-            if self.clock.over or not more:
-                return End(level, outcome, temperature, there)
-            # poses that had not settled had made the residuals look more alike than they are
-            believed, state, lin = known.inflation, outcome.state, outcome.lin
-            if bent and there.believed is not None:
-                level = self._unbent(level, there.believed.pattern)
-                state, lin = self._map_solved(level, state)
-            if finer < level.grid.spacing:
-                index += 1
-                level, state, lin = self._lay(
-                    finer, state.T_map_camera, Map(state.heights, level.grid), True
-                )
-            level, temperature, outcome = self._last(
-                level, state, lin, phase, index, index + 1, known
-            )
-            self.clock.lap(f"level {index} {phase}")
-        return End(level, outcome, temperature)
+            index += 1
 
-    def _last(
-        self, level: Level, state: State, lin: Linearisation, phase: str, index: int, levels: int,
+    def settle(
+        self, level: Level, state: State, lin: Linearisation, index: int,
         known: certainty.Correlation | None,
-    ) -> tuple[Level, float, Outcome]:  # fmt: skip
-        """Lay patches anew and settle on them; return the level, the priors' weight, the end."""
-        level = self._patched(level, state, lin)
+    ) -> End:  # fmt: skip
+        """Lay patches anew beside the last level's map, and settle on both."""
+        level, phase = self._patched(level, state, lin), phases(1, self.preset)[-1]
         near = reduced.reduce(lin, self.workers, NEAR, self.free)
         temperature, outcome = self._descend(
-            level, state, lin, near, phase, index, levels, known, True
+            level, state, lin, near, phase, index, index + 1, known, True
         )
-        return level, temperature, outcome
+        self.clock.lap(f"level {index} {phase}")
+        return End(level, outcome, temperature, index, known.inflation if known else 1.0)
 
-    def _bent(self, there: Known, sigma: float) -> bool:
-        """Whether the camera's fixed pattern calls for steps that are worth taking."""
-        if there.believed is None:
-            return False
-        gain, known = there.believed.gain, there.correlation
-        variance = max(known.inflation, known.overall) * sigma**2
-        dof = 6 * max(int(self.free.sum()), 1)
-        return bool(gain @ known.S @ gain > dof * BENT**2 * variance)
-
-    def _unbent(self, level: Level, bend: NDArray[np.float64]) -> Level:
+    def unbent(self, level: Level, bend: NDArray[np.float64]) -> Level:
         """Take the camera's fixed pattern (m,) off all points, in place of the present one.
 
         Returns the level with its points likewise.
@@ -228,7 +174,7 @@ class Engine:
         self.problem, self.bend = pattern.without(self.problem, step), bend
         return replace(level, problem=pattern.without(level.problem, step))
 
-    def _lay(
+    def lay(
         self, spacing: float, poses: NDArray[np.float64], before: Map | None, last: bool
     ) -> tuple[Level, State, Linearisation]:
         """Return a level, and its map solved for the poses."""
@@ -236,20 +182,20 @@ class Engine:
         heights = level_heights(
             level, before.heights if before else None, before.grid if before else None
         )
-        return level, *self._map_solved(level, State(poses, heights))
+        return level, *self.map_solved(level, State(poses, heights))
 
-    def _map_solved(self, level: Level, state: State) -> tuple[State, Linearisation]:
+    def map_solved(self, level: Level, state: State) -> tuple[State, Linearisation]:
+        """Return the state with the map that suits its poses best."""
         return solve_map(
             level.problem, level.grid, state, level.loss, level.smooth, self.workers, 1, NEAR
         )
 
     @property
-    def _details_vouch(self) -> bool:
-        """Whether patches and the camera's pattern may speak.
+    def _patches_vouch(self) -> bool:
+        """Whether patches may speak: not where noise in slopes is much of what is known.
 
-        Not where noise in slopes is much of what is known: nothing takes that off what they say, and
-        either of them would slide frames along a bare table. Without measured poses there is
-        nothing else to go by.
+        Their slopes are noisy too, and nothing takes that off: they would slide frames along a bare
+        table. Without measured poses there is nothing else to go by.
         """
         guarded = self.preset.prior and self.noisy >= NOISY
         return self.preset.robust > 0 and not guarded
@@ -258,7 +204,7 @@ class Engine:
         self, poses: NDArray[np.float64], spacing: float, known: certainty.Correlation | None
     ) -> NDArray[np.float64]:
         """Return the poses as patches alone would have them."""
-        if not self._details_vouch or self.clock.over:
+        if not self._patches_vouch or self.clock.over:
             return poses
         poses = tied_by_patches(
             self.problem, poses, spacing, self.prior, self.acting,
@@ -269,7 +215,7 @@ class Engine:
 
     def _patched(self, level: Level, state: State, lin: Linearisation) -> Level:
         """Return the level with patches laid anew over what its map cannot hold."""
-        if not self._details_vouch:
+        if not self._patches_vouch:
             return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
@@ -277,7 +223,7 @@ class Engine:
         )  # fmt: skip
         return replace(level, tied=tied)
 
-    def _with_patches(
+    def with_patches(
         self, level: Level, state: State, lin: Linearisation, at: reduced.Reduction
     ) -> reduced.Reduction:
         """Return the reduction with what the patches say in its matrix."""
@@ -299,49 +245,6 @@ class Engine:
         )
         return temperature, outcome
 
-    def known_at(self, level: Level, state: State, loss: Loss) -> Known:
-        """Return what the points say at a state, but for those that must not vouch for it."""
-        problem = level.problem
-        if self.preset.robust:
-            problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
-        lin = linearise(problem, level.grid, state, loss, self.workers, level.smooth)
-        at = reduced.reduce(lin, self.workers, free=self.free)
-        if level.tied:
-            # what groups of points say is told from surfaces that fit
-            tied = level.tied.patches.fitted(state.T_map_camera, self.workers)
-            level = replace(level, tied=tied)
-        at = self._with_patches(level, state, lin, at)
-        believed = self._believed(problem, level.grid, state, loss, lin, at)
-        found = certainty.correlation(
-            problem, level.grid, state, loss, lin, self.prior, self.free, self.workers, at,
-            believed, level.tied.patches if level.tied else None,
-        )  # fmt: skip
-        self.clock.lap("certainty")
-        return Known(problem, lin, found, believed)
-
-    def _believed(
-        self, problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation,
-        at: reduced.Reduction,
-    ) -> pattern.Believed | None:  # fmt: skip
-        """Return what the points say of the camera's fixed pattern; None: there is none."""
-        if self.plain or not self.preset.pattern or problem.waves is None or not self.free.any():
-            return None
-        if self.bend is None and not self._details_vouch:
-            return None
-        now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
-        variance = robust_sigma(lin.residuals) ** 2
-        matrix, _ = self.acting.normal_equations(state.T_map_camera, lin.pivots)
-        # where the level ended data and measured poses balance: no gradient is left
-        held, none = at.S + variance * matrix, np.zeros(len(at.S))
-        found = pattern.answers(problem, grid, state, loss, lin, at, problem.waves, self.workers)
-        believed = pattern.believe(
-            found, held, none, np.repeat(self.free, 6), now, pattern.CAUTION * variance
-        )
-        if self.bend is None and not believed.strength:
-            self.plain = True
-            return None
-        return believed
-
     def _no_finer(
         self, levels: list[float], index: int, level: Level, outcome: Outcome,
         known: certainty.Correlation,
@@ -361,7 +264,7 @@ class Engine:
     def _finest(self, known: certainty.Correlation, outcome: Outcome) -> float:
         return schedule.finest_spacing(self.problem, np.sqrt(known.inflation) * outcome.sigma)
 
-    def _finer(self, spacing: float, known: certainty.Correlation, outcome: Outcome) -> float:
+    def finer(self, spacing: float, known: certainty.Correlation, outcome: Outcome) -> float:
         """Return a spacing that noise allows if it is clearly finer, no less than half; or it."""
         if self.options.resolution is not None or self.preset.whole:
             return spacing
@@ -420,7 +323,7 @@ class Engine:
     ) -> certainty.Correlation:
         return certainty.correlation(
             level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,
-            self._with_patches(level, state, lin, at),
+            self.with_patches(level, state, lin, at),
         )  # fmt: skip
 
 

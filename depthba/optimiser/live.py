@@ -17,6 +17,7 @@ from depthba.errors import DatasetError
 from depthba.optimiser import schedule
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
+from depthba.optimiser.ending import gone_on
 from depthba.optimiser.engine import PASSING, Engine
 from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import pose_prior
@@ -179,9 +180,11 @@ class Registration:
         overlap = overlap_matrix(problem, problem.T_map_camera, finest)
         held = held_frames(problem, overlap)
         engine = self._engine(problem, np.array([not why for why in held]))
-        end = engine.run([COARSER * finest, finest], np.stack(self._T_map_camera), refining=True)
+        poses = np.stack(self._T_map_camera)
+        end, known = gone_on(engine, engine.run([COARSER * finest, finest], poses, refining=True))
         self._T_map_camera = list(end.outcome.state.T_map_camera)
-        return conclude(engine, end, tuple(self._ids), tuple(self._stamps), measured, held, overlap)
+        ids, stamps = tuple(self._ids), tuple(self._stamps)
+        return conclude(engine, end, known, ids, stamps, measured, held, overlap)
 
     def _begin(self, frame: Frame, cloud: NDArray[np.float32]) -> None:
         self._T_map_world = choose_map_frame(self._map_frame, [cloud], frame.T_world_camera[None])
@@ -238,7 +241,7 @@ class Registration:
         engine = self._engine(part, np.arange(len(chosen)) == len(chosen) - 1)
         engine.settled = PASSING
         out = poses.copy()
-        out[new] = engine.run(levels, poses[chosen], judged=False).outcome.state.T_map_camera[-1]
+        out[new] = engine.run(levels, poses[chosen]).outcome.state.T_map_camera[-1]
         return out
 
     def _settled(
@@ -249,5 +252,5 @@ class Registration:
         engine = self._engine(problem, np.array([not why for why in held]))
         engine.options = replace(self.options, max_iterations=SETTLING)
         engine.settled = PASSING
-        end = engine.run([COARSER * finest], poses, refining=True, judged=False)
+        end = engine.run([COARSER * finest], poses, refining=True)
         return end.outcome.state.T_map_camera

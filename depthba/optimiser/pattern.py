@@ -225,7 +225,6 @@ class Believed:
 def believe(
     found: Answers,
     held: Array,
-    gradient: Array,
     keep: NDArray[np.bool_],
     now: Array,
     variance: float,
@@ -234,8 +233,8 @@ def believe(
 
     Args:
         found: their normal equations, the map eliminated.
-        held: (6N, 6N) what holds the poses, the measured ones included.
-        gradient: (6N,), likewise.
+        held: (6N, 6N) what holds the poses, the measured ones included. They balance what the
+            points say: no gradient is left.
         keep: (6N,), the poses that move.
         now: (m,) the present pattern.
         variance: m^2, of a residual, with what makes up for its errors not being independent.
@@ -249,7 +248,7 @@ def believe(
     known = values > KNOWN * values[-1]
     values = np.where(known, values, 0.0)
     # every eigenvector is judged by itself: what the data say it is, and how surely
-    pull = vectors.T @ (found.gradient - follow.T @ gradient[keep]) / variance
+    pull = vectors.T @ found.gradient / variance
     call = np.where(known, values * (vectors.T @ now) - pull, 0.0)
     strength = _strength(values[known], call[known])
     pattern = vectors @ (strength**2 / (1 + strength**2 * values) * call)

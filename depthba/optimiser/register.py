@@ -13,6 +13,7 @@ from depthba.dataset import Dataset
 from depthba.optimiser import schedule
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
+from depthba.optimiser.ending import gone_on
 from depthba.optimiser.engine import Engine
 from depthba.optimiser.grid import make_grid
 from depthba.optimiser.overlap import held_frames, overlap_matrix
@@ -83,6 +84,6 @@ def _register(
     )
     clock.lap("prepare")
     engine = Engine(problem, options, prior, free, workers, clock, callback)
-    end = engine.run(levels, problem.T_map_camera)
+    end, known = gone_on(engine, engine.run(levels, problem.T_map_camera))
     ids, stamps = tuple(f.id for f in dataset), tuple(f.stamp for f in dataset)
-    return conclude(engine, end, ids, stamps, start, held, overlap)
+    return conclude(engine, end, known, ids, stamps, start, held, overlap)

@@ -194,6 +194,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "largest_move_rad": max((frame.move_r for frame in result.frames), default=0.0),
         "sigma_m": result.sigma,
         "fixed_pattern_m": result.fixed_pattern,
+        "refused_pattern_m": result.refused_pattern,
         "spacing_m": result.depth_map.spacing,
         "weak": [
             {
@@ -232,6 +233,11 @@ def report(name: str, outcome: Outcome, most: int = 6) -> list[str]:
         lines.append(
             f"  pattern       {length(result.fixed_pattern)} rms of the range, the same in every "
             "frame, found and taken off"
+        )
+    if result.refused_pattern:
+        lines.append(
+            f"  pattern       {length(result.refused_pattern)} rms would fit, but explains little: "
+            "left in; look to the intrinsics"
         )
     lines += _first(
         "weak",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,6 +39,14 @@ def image_places() -> Floats:
     return np.stack([u.ravel(), v.ravel()])
 
 
+def bend_of(dataset: Dataset) -> Floats:
+    """Return (HEIGHT, WIDTH), m, an error of the range."""
+    waves = waves_of(dataset.sensor, NOISE)
+    assert waves is not None
+    strengths = STRENGTH * np.random.default_rng(1).standard_normal(len(waves))
+    return (waves.over_image(*image_places()) @ strengths).reshape(HEIGHT, WIDTH)
+
+
 @pytest.fixture(scope="module")
 def white(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     path = tmp_path_factory.mktemp("white") / "scene"
@@ -46,12 +56,8 @@ def white(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="module")
 def bent(white: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """The same views, all with one error of the range."""
-    waves = waves_of(white.sensor, NOISE)
-    assert waves is not None
-    strengths = STRENGTH * np.random.default_rng(1).standard_normal(len(waves))
-    bend = (waves.over_image(*image_places()) @ strengths).reshape(HEIGHT, WIDTH)
     path = tmp_path_factory.mktemp("bent") / "scene"
-    return write_scene(path, frames=FRAMES, noise=NOISE, bend=bend)
+    return write_scene(path, frames=FRAMES, noise=NOISE, bend=bend_of(white))
 
 
 def test_waves_are_as_large_as_stated_and_hold_no_tilt(white: Dataset) -> None:
@@ -153,6 +159,35 @@ def test_where_there_is_none_nothing_is_made_up(white: Dataset) -> None:
     assert_array_equal(one.covariance, other.covariance)
 
 
+def test_what_only_some_frames_have_is_not_the_pattern_of_the_camera(
+    bent: Dataset, tmp_path: Path
+) -> None:
+    """Two cameras, taken for one: no pattern makes the frames of both agree."""
+    mixed = tmp_path / "mixed"
+    shutil.copytree(bent.path, mixed)
+    other = write_scene(tmp_path / "other", frames=FRAMES, noise=NOISE, bend=-bend_of(bent))
+    lines = [(d / "frames.jsonl").read_text().splitlines() for d in (bent.path, other.path)]
+    for frame in other.frames[5:]:
+        stored = frame.files["depth"].path
+        shutil.copy(other.path / stored, mixed / stored)
+    (mixed / "frames.jsonl").write_text("\n".join(lines[0][:5] + lines[1][5:]) + "\n")
+    dataset = Dataset.open(mixed)
+    noise = dataset.sensor.noise
+    assert noise is not None
+    little = replace(noise, sigma_m=noise.sigma_m / 20)
+    dataset = replace(dataset, sensor=replace(dataset.sensor, noise=little))
+    result = depthba.register(dataset, Options(threads=1))
+    assert result.fixed_pattern == 0.0
+    assert result.refused_pattern > 2 * little.sigma_m
+    plain = depthba.register(dataset, Options(threads=1, fixed_pattern=False))
+    assert_array_equal(result.T_world_camera, plain.T_world_camera)
+    # one that all frames have is believed whatever the sensor states
+    true = depthba.register(
+        replace(bent, sensor=replace(bent.sensor, noise=little)), Options(threads=1)
+    )
+    assert true.fixed_pattern > 0.0 and true.refused_pattern == 0.0
+
+
 def test_the_strength_is_that_of_the_waves() -> None:
     rng = np.random.default_rng(0)
     own = np.diag(np.geomspace(1e6, 1e10, 60))
@@ -161,7 +196,7 @@ def test_the_strength_is_that_of_the_waves() -> None:
     call = own @ bend + np.sqrt(variance * np.diag(own)) * rng.standard_normal(60)
     found = pattern.Answers(own, np.zeros((6, 60)), -call, np.zeros((1, 1, 60), np.float32))
     keep = np.ones(6, bool)
-    believed = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), variance)
+    believed = pattern.believe(found, np.eye(6), keep, np.zeros(60), variance)
     assert believed.strength == pytest.approx(0.003, rel=0.3)
     error = believed.pattern - bend
     normalised = error[-30:] ** 2 * np.diag(own)[-30:] / variance
@@ -169,7 +204,7 @@ def test_the_strength_is_that_of_the_waves() -> None:
     # noise alone
     call = np.sqrt(variance * np.diag(own)) * rng.standard_normal(60)
     found = replace(found, gradient=-call)
-    none = pattern.believe(found, np.eye(6), np.zeros(6), keep, np.zeros(60), variance)
+    none = pattern.believe(found, np.eye(6), keep, np.zeros(60), variance)
     assert none.strength == 0.0
     assert_array_equal(none.pattern, 0.0)
     assert_array_equal(none.inverse, 0.0)

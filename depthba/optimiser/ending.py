@@ -1,0 +1,154 @@
+"""Finds out what is known where the last level ended, and goes on where that asks for it.
+
+The residuals may turn out less correlated than was thought, so that the measured poses weigh less
+or a finer map is allowed; and the camera may have a fixed pattern to be taken off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from depthba.optimiser import certainty, pattern, reduced
+from depthba.optimiser.bends import without_bends
+from depthba.optimiser.engine import End, Engine, Map
+from depthba.optimiser.grid import Grid
+from depthba.optimiser.level import Level
+from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
+from depthba.optimiser.problem import Problem
+
+# Times that the last level goes on.
+AGAIN = 4
+# It goes on when the residuals' inflation has come out below this share of what was believed.
+LESS = 0.8
+# It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
+BENT = 0.3
+# A pattern up to so many times the noise that the sensor states is taken at its word.
+MODEST = 2.0
+# A larger one must leave residuals whose inflation is below this share of what it was. Wrong
+# intrinsics, and frames that can slide, mimic patterns that explain less.
+CLEARED = 0.15
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the points say at a state, but for those that must not vouch for it."""
+
+    problem: Problem
+    """Without the points at sharp bends."""
+    lin: Linearisation
+    correlation: certainty.Correlation
+    believed: pattern.Believed | None = None
+    """The fixed pattern of the camera; None: there is none."""
+
+    @property
+    def inflation(self) -> float:
+        """The larger of the factors on the variance of what the points say."""
+        return max(self.correlation.inflation, self.correlation.overall)
+
+
+@dataclass(frozen=True)
+class _Before:
+    """Where a pattern was taken off that has yet to prove itself."""
+
+    end: End
+    inflation: float
+    problem: Problem
+    """All points, as they were measured."""
+    size: float
+    """Root mean square of the pattern over the image, m."""
+
+
+def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
+    """Go on from the end of the last level for as long as what is known there asks for it.
+
+    Returns where that ends, and what is known there if it was found out.
+    """
+    before: _Before | None = None
+    for _ in range(AGAIN):
+        there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
+        if before is not None and there.inflation > CLEARED * before.inflation:
+            engine.problem, engine.bend, engine.plain = before.problem, None, True
+            engine.refused_pattern, end = before.size, before.end
+            there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
+        before = None
+        known, outcome, level = there.correlation, end.outcome, end.level
+        finer = engine.finer(level.grid.spacing, known, outcome)
+        less = known.inflation < LESS * end.believed
+        bent = _bent(engine, there, outcome.sigma)
+        # a pattern may be what keeps the poses from settling
+        more = bent or (outcome.converged and (less or finer < level.grid.spacing))
+        if engine.clock.over or not more:
+            return end, there
+        # poses that had not settled had made the residuals look more alike than they are
+        state, lin, index = outcome.state, outcome.lin, end.index
+        if bent and there.believed is not None:
+            before = _on_trial(engine, end, there)
+            level = engine.unbent(level, there.believed.pattern)
+            state, lin = engine.map_solved(level, state)
+        if finer < level.grid.spacing:
+            index += 1
+            coarse = Map(state.heights, level.grid)
+            level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
+        end = engine.settle(level, state, lin, index, known)
+    return end, None
+
+
+def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
+    """Return what the points say at a state, but for those that must not vouch for it."""
+    problem, workers = level.problem, engine.workers
+    if engine.preset.robust:
+        problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
+    lin = linearise(problem, level.grid, state, loss, workers, level.smooth)
+    at = reduced.reduce(lin, workers, free=engine.free)
+    if level.tied:
+        # what groups of points say is told from surfaces that fit
+        level = replace(level, tied=level.tied.patches.fitted(state.T_map_camera, workers))
+    at = engine.with_patches(level, state, lin, at)
+    believed = _believed(engine, problem, level.grid, state, loss, lin, at)
+    found = certainty.correlation(
+        problem, level.grid, state, loss, lin, engine.prior, engine.free, workers, at, believed,
+        level.tied.patches if level.tied else None,
+    )  # fmt: skip
+    engine.clock.lap("certainty")
+    return Known(problem, lin, found, believed)
+
+
+def _believed(
+    engine: Engine, problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation,
+    at: reduced.Reduction,
+) -> pattern.Believed | None:  # fmt: skip
+    """Return what the points say of the camera's fixed pattern; None: there is none."""
+    waves, free = problem.waves, engine.free
+    if engine.plain or not engine.preset.pattern or waves is None or not free.any():
+        return None
+    now = np.zeros(len(waves)) if engine.bend is None else engine.bend
+    variance = robust_sigma(lin.residuals) ** 2
+    matrix, _ = engine.acting.normal_equations(state.T_map_camera, lin.pivots)
+    found = pattern.answers(problem, grid, state, loss, lin, at, waves, engine.workers)
+    believed = pattern.believe(
+        found, at.S + variance * matrix, np.repeat(free, 6), now, pattern.CAUTION * variance
+    )
+    engine.plain = engine.bend is None and not believed.strength
+    return None if engine.plain else believed
+
+
+def _bent(engine: Engine, there: Known, sigma: float) -> bool:
+    """Whether the camera's fixed pattern calls for steps that are worth taking."""
+    if there.believed is None:
+        return False
+    gain, variance = there.believed.gain, there.inflation * sigma**2
+    dof = 6 * max(int(engine.free.sum()), 1)
+    return bool(gain @ there.correlation.S @ gain > dof * BENT**2 * variance)
+
+
+def _on_trial(engine: Engine, end: End, there: Known) -> _Before | None:
+    """Return where to go back to if the pattern proves false; None: it need not prove itself."""
+    waves, noise = engine.problem.waves, engine.problem.noise
+    if engine.bend is not None or there.believed is None or waves is None:
+        return None
+    size = waves.size(there.believed.pattern)
+    if noise is not None and size <= MODEST * noise:
+        return None
+    return _Before(end, there.inflation, engine.problem, size)
