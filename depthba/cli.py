@@ -75,11 +75,18 @@ VERBS = {
         extra="eval",
         needs=("rerun",),
     ),
+    "plot": Verb(
+        "depthba.verbs.plot",
+        "Draw pictures of a run: map, residuals, trajectory, covariance, change.",
+    ),
     "convert": Verb(
         "depthba.verbs.convert",
         "Turn other people's data into datasets, and results into other people's files.",
     ),
     "doctor": Verb("depthba.verbs.doctor", "Check this machine, or a dataset."),
+    "completion": Verb(
+        "depthba.verbs.completion", "Print the script that lets a shell complete these words."
+    ),
 }
 
 

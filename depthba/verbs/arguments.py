@@ -6,8 +6,8 @@ import contextlib
 import dataclasses
 import inspect
 import io
-from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_type_hints
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypeVar, Union, get_type_hints
 
 import tyro
 
@@ -36,10 +36,7 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
         OptionError: the file behind ``--config`` has an unknown key or a wrong value.
         OSError: that file cannot be read.
     """
-    config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
-    with_config: Any = dataclasses.make_dataclass(
-        kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
-    )
+    with_config = _with_config(kind)
     path = _config_path(words)
     default = None if path is None else _with_defaults(with_config, _read(path, kind))
     parsed: Any = tyro.cli(
@@ -53,6 +50,31 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
     values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(with_config)}
     del values["config"]
     return kind(**values)
+
+
+def print_completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shell: str) -> None:
+    """Print the script with which a shell completes a command of several verbs.
+
+    Args:
+        kinds: by verb, the dataclass of its arguments and one line about it.
+        prog: the command.
+        shell: bash, zsh or fish.
+    """
+    verbs = tuple(
+        Annotated[_with_config(kind), tyro.conf.subcommand(name, description=text)]
+        for name, (kind, text) in kinds.items()
+    )
+    with contextlib.suppress(SystemExit):  # how tyro ends once it has printed
+        both: Any = Union[verbs]  # noqa: UP007 (of a tuple, which has no other form)
+        tyro.cli(both, prog=prog, args=["--tyro-print-completion", shell], config=_STYLE)
+
+
+def _with_config(kind: type[Any]) -> Any:
+    """Return the dataclass with the option --config beside its own."""
+    config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
+    return dataclasses.make_dataclass(
+        kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
+    )
 
 
 def known_keys(kind: type[Any]) -> dict[str, Any]:
