@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import inspect
 import io
+import re
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypeVar, Union, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from depthba.errors import OptionError
 
@@ -46,14 +55,15 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
         description=inspect.cleandoc(kind.__doc__ or ""),
         default=default,
         config=_STYLE,
+        registry=_FORMS,
     )
     values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(with_config)}
     del values["config"]
     return kind(**values)
 
 
-def print_completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shell: str) -> None:
-    """Print the script with which a shell completes a command of several verbs.
+def completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shell: str) -> str:
+    """Return the script with which a shell completes a command of several verbs.
 
     Args:
         kinds: by verb, the dataclass of its arguments and one line about it.
@@ -61,12 +71,35 @@ def print_completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shel
         shell: bash, zsh or fish.
     """
     verbs = tuple(
-        Annotated[_with_config(kind), tyro.conf.subcommand(name, description=text)]
-        for name, (kind, text) in kinds.items()
+        Annotated[_with_config(kind), tyro.conf.subcommand(name)]
+        for name, (kind, _) in kinds.items()
     )
-    with contextlib.suppress(SystemExit):  # how tyro ends once it has printed
-        both: Any = Union[verbs]  # noqa: UP007 (of a tuple, which has no other form)
-        tyro.cli(both, prog=prog, args=["--tyro-print-completion", shell], config=_STYLE)
+    both: Any = Union[verbs]  # noqa: UP007 (of a tuple, which has no other form)
+    words = ["--tyro-print-completion", shell]
+    out = io.StringIO()
+    # tyro ends the process once it has printed
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        tyro.cli(both, prog=prog, args=words, config=_STYLE, registry=_FORMS)
+
+    def cleaned(match: re.Match[str]) -> str:
+        spec = ast.literal_eval(match["spec"])
+        for name, (_, text) in kinds.items():
+            spec["subcommands"][name]["description"] = text
+        return f"{match['head']}{_on_one_line(spec)!r}"
+
+    # a line break in a description would be taken for the next candidate
+    return re.sub(
+        r"^(?P<head>COMPLETION_SPEC = )(?P<spec>.*)$", cleaned, out.getvalue(), flags=re.M
+    )
+
+
+def _on_one_line(value: Any) -> Any:
+    """Return nested lists and dictionaries with every text on one line."""
+    if isinstance(value, dict):
+        return {key: _on_one_line(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_on_one_line(item) for item in value]
+    return " ".join(value.split()) if isinstance(value, str) else value
 
 
 def _with_config(kind: type[Any]) -> Any:
@@ -81,11 +114,44 @@ def known_keys(kind: type[Any]) -> dict[str, Any]:
     """Return the keys that a configuration file may have for a dataclass, with their types."""
     keys: dict[str, Any] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            keys |= known_keys(hint)
+        if group := _group(hint):
+            keys |= known_keys(group)
         else:
             keys[name] = hint
     return keys
+
+
+def _group(hint: Any) -> type[Any] | None:
+    """Return the dataclass behind a hint, with or without a note on it; None: it is none."""
+    bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    return bare if isinstance(bare, type) and dataclasses.is_dataclass(bare) else None
+
+
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let the help of ``X | None`` read as that of X; None can still be given as a word."""
+    if get_origin(info.type) not in (Union, UnionType):
+        return None
+    members = [member for member in get_args(info.type) if member is not NoneType]
+    if len(members) != 1 or len(get_args(info.type)) != 2 or get_origin(members[0]) is Literal:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(members[0], info.markers))
+    if isinstance(inner, UnsupportedTypeAnnotationError) or not isinstance(inner.nargs, int):
+        return None
+
+    def read(words: list[str]) -> Any:
+        return None if words == ["None"] else inner.instance_from_str(words)
+
+    return dataclasses.replace(
+        inner,
+        nargs=1 if inner.nargs == 1 else (inner.nargs, 1),
+        instance_from_str=read,
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda v: ["None"] if v is None else inner.str_from_instance(v),
+    )
+
+
+_FORMS = ConstructorRegistry()
+_FORMS.primitive_rule(_optional)
 
 
 def _config_path(words: Sequence[str]) -> str | None:
@@ -144,8 +210,8 @@ def _with_defaults(kind: type[Any], values: dict[str, Any]) -> Any:
     hints = get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            filled[field.name] = _with_defaults(hint, values)
+        if group := _group(hint):
+            filled[field.name] = _with_defaults(group, values)
         elif field.name in values:
             filled[field.name] = values[field.name]
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:

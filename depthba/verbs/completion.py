@@ -29,7 +29,7 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Print the script, made from the parsers of all verbs that can be imported here."""
     from depthba.cli import VERBS
-    from depthba.verbs.arguments import print_completion
+    from depthba.verbs.arguments import completion
 
     kinds: dict[str, tuple[type[Any], str]] = {}
     for name, verb in VERBS.items():
@@ -37,5 +37,5 @@ def run(arguments: Arguments) -> int:
             kinds[name] = importlib.import_module(verb.module).Arguments, verb.help
         except ModuleNotFoundError as error:
             note(f"note: {name} is left out, it needs {error.name}: depthba[{verb.extra}]")
-    print_completion(kinds, "depthba", arguments.shell)
+    print(completion(kinds, "depthba", arguments.shell), flush=True)
     return DONE
