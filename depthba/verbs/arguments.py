@@ -9,9 +9,10 @@ import inspect
 import io
 import re
 from collections.abc import Mapping, Sequence
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import docstring_parser
 import tyro
 from tyro.constructors import (
     ConstructorRegistry,
@@ -104,10 +105,28 @@ def _on_one_line(value: Any) -> Any:
 
 def _with_config(kind: type[Any]) -> Any:
     """Return the dataclass with the option --config beside its own."""
+    _joined_help(kind)
     config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
     return dataclasses.make_dataclass(
         kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
     )
+
+
+def _joined_help(kind: type[Any]) -> None:
+    """Give the fields of a dataclass, and of those in it, their docstrings as one line each.
+
+    tyro keeps the line breaks of a docstring, which would fall anywhere on a line of a terminal.
+    """
+    told: dict[str, str] = {}
+    for one in reversed(kind.__mro__[:-1]):
+        for param in docstring_parser.parse_from_object(one).params:
+            told[param.arg_name] = " ".join((param.description or "").split())
+    hints = get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        if group := _group(hints[field.name]):
+            _joined_help(group)
+        elif told.get(field.name):
+            field.metadata = MappingProxyType({**field.metadata, "help": told[field.name]})
 
 
 def known_keys(kind: type[Any]) -> dict[str, Any]:

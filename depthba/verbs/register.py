@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from depthba.convert import Reading
-from depthba.errors import MissingPackage, OptionError
+from depthba.errors import DatasetError, MissingPackage, OptionError
 from depthba.options import Options
 from depthba.verbs import DONE, NOT_TO_BE_TRUSTED, WRONG_USAGE
 from depthba.verbs.output import angle, length, note, print_json
@@ -78,7 +78,12 @@ def run(arguments: Arguments) -> int:
     with contextlib.ExitStack() as stack:
         out, overwrite, options = arguments.out, arguments.overwrite, arguments.options
         source = arguments.dataset
-        if source.exists() and not (source / "dataset.json").exists():
+        if not source.exists():
+            raise DatasetError(
+                f"{source}: no such file or folder, expected a dataset, or a source that "
+                "`depthba convert --list` names"
+            )
+        if not (source / "dataset.json").exists():
             out = default_path(source.stem) if out is None else out
             stack.enter_context(removed_on_failure(out, overwrite))
             dataset = _imported(arguments, out)
