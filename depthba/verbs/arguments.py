@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import inspect
 import io
-import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -63,17 +61,16 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
     return kind(**values)
 
 
-def completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shell: str) -> str:
+def completion(kinds: Mapping[str, type[Any]], prog: str, shell: str) -> str:
     """Return the script with which a shell completes a command of several verbs.
 
     Args:
-        kinds: by verb, the dataclass of its arguments and one line about it.
+        kinds: by verb, the dataclass of its arguments.
         prog: the command.
         shell: bash, zsh or fish.
     """
     verbs = tuple(
-        Annotated[_with_config(kind), tyro.conf.subcommand(name)]
-        for name, (kind, _) in kinds.items()
+        Annotated[_with_config(kind), tyro.conf.subcommand(name)] for name, kind in kinds.items()
     )
     both: Any = Union[verbs]  # noqa: UP007 (of a tuple, which has no other form)
     words = ["--tyro-print-completion", shell]
@@ -81,26 +78,7 @@ def completion(kinds: Mapping[str, tuple[type[Any], str]], prog: str, shell: str
     # tyro ends the process once it has printed
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         tyro.cli(both, prog=prog, args=words, config=_STYLE, registry=_FORMS)
-
-    def cleaned(match: re.Match[str]) -> str:
-        spec = ast.literal_eval(match["spec"])
-        for name, (_, text) in kinds.items():
-            spec["subcommands"][name]["description"] = text
-        return f"{match['head']}{_on_one_line(spec)!r}"
-
-    # a line break in a description would be taken for the next candidate
-    return re.sub(
-        r"^(?P<head>COMPLETION_SPEC = )(?P<spec>.*)$", cleaned, out.getvalue(), flags=re.M
-    )
-
-
-def _on_one_line(value: Any) -> Any:
-    """Return nested lists and dictionaries with every text on one line."""
-    if isinstance(value, dict):
-        return {key: _on_one_line(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_on_one_line(item) for item in value]
-    return " ".join(value.split()) if isinstance(value, str) else value
+    return out.getvalue()
 
 
 def _with_config(kind: type[Any]) -> Any:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from depthba.verbs import DONE
-from depthba.verbs.output import note
+from depthba.verbs.output import note, print_json
 
 Shell = Literal["bash", "zsh", "fish"]
 
@@ -24,6 +24,8 @@ class Arguments:
 
     shell: Annotated[Shell, tyro.conf.Positional, tyro.conf.arg(metavar="bash|zsh|fish")]
     """The shell to print it for."""
+    json: bool = False
+    """Print one JSON object on stdout in place of the script: shell, script."""
 
 
 def run(arguments: Arguments) -> int:
@@ -31,11 +33,15 @@ def run(arguments: Arguments) -> int:
     from depthba.cli import VERBS
     from depthba.verbs.arguments import completion
 
-    kinds: dict[str, tuple[type[Any], str]] = {}
+    kinds: dict[str, type[Any]] = {}
     for name, verb in VERBS.items():
         try:
-            kinds[name] = importlib.import_module(verb.module).Arguments, verb.help
+            kinds[name] = importlib.import_module(verb.module).Arguments
         except ModuleNotFoundError as error:
             note(f"note: {name} is left out, it needs {error.name}: depthba[{verb.extra}]")
-    print(completion(kinds, "depthba", arguments.shell), flush=True)
+    script = completion(kinds, "depthba", arguments.shell)
+    if arguments.json:
+        print_json({"shell": arguments.shell, "script": script})
+    else:
+        print(script, flush=True)
     return DONE
