@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/set-up
 
-.PHONY: help setup demo test lint format bench screenshots clean
+.PHONY: help setup demo docs test lint format bench screenshots clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -16,6 +16,10 @@ $(STAMP): pyproject.toml constraints.txt setup/install.sh
 
 demo: $(STAMP)  ## one scene from end to end: generate, register, evaluate, record
 	@$(BIN)/depthba demo
+
+docs: $(STAMP)  ## the site of the documentation, in build/site
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo 'build/site/index.html'
 
 test: $(STAMP)  ## the fast tests
 	@$(BIN)/pytest -n auto --maxprocesses 8
@@ -34,7 +38,8 @@ format: $(STAMP)  ## let ruff put the code into its form
 bench: $(STAMP)  ## the benchmarks
 	@$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only
 
-screenshots: $(STAMP)  ## the pictures of the viewer in docs/; needs chromium, xvfb, mesa-vulkan-drivers
+screenshots: $(STAMP)  ## the pictures in docs/; needs chromium, xvfb, mesa-vulkan-drivers
+	@$(BIN)/python docs/plot_pictures.py
 	@$(BIN)/python docs/screenshots.py
 
 clean:  ## remove .venv and what tools left; runs in logs/ stay

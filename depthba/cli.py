@@ -5,6 +5,7 @@ Nothing heavy is imported before the verb is known, so that ``depthba --help`` a
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
 import os
@@ -75,11 +76,18 @@ VERBS = {
         extra="eval",
         needs=("rerun",),
     ),
+    "plot": Verb(
+        "depthba.verbs.plot",
+        "Draw pictures of a run: map, residuals, trajectory, covariance, change.",
+    ),
     "convert": Verb(
         "depthba.verbs.convert",
         "Turn other people's data into datasets, and results into other people's files.",
     ),
     "doctor": Verb("depthba.verbs.doctor", "Check this machine, or a dataset."),
+    "completion": Verb(
+        "depthba.verbs.completion", "Print the script that lets a shell complete these words."
+    ),
 }
 
 
@@ -119,8 +127,9 @@ def _main(words: list[str]) -> int:
         print(f"depthba {__version__}")
         return DONE
     if name not in VERBS:
-        choices = ", ".join(VERBS)
-        print(f"depthba: no verb {name!r}; choose from: {choices}", file=sys.stderr)
+        near = difflib.get_close_matches(name, VERBS, n=1)
+        meant = f"did you mean {near[0]}? The verbs" if near else "the verbs"
+        print(f"depthba: no verb {name!r}; {meant} are: {', '.join(VERBS)}", file=sys.stderr)
         return WRONG_USAGE
     verb = VERBS[name]
     if missing := _missing(verb):
@@ -145,6 +154,12 @@ def _overview() -> str:
         "usage: depthba VERB [arguments]",
         "",
         "Registers many depth frames of one scene at once: every frame's pose and a depth map.",
+        "",
+        "first steps:",
+        "  depthba demo                                             see it work, end to end",
+        "  depthba register my-pngs --intrinsics FX FY CX CY --depth-scale 0.001 --out my-run",
+        "                                                           a folder of depth images",
+        "  depthba plot my-run                                      pictures of what came out",
         "",
         "verbs:",
     ]

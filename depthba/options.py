@@ -30,11 +30,11 @@ class Options:
     smoothing: float | None = None
     """Weight of the smoothing term against one point. None: the preset's own."""
     priors: bool = True
-    """Take the measured poses as measurements, too. Off: they are only where to start (the paper
-    preset never takes them)."""
+    """The measured poses count as measurements, too. With --no-priors they are only where to start
+    (the paper preset never takes them)."""
     fixed_pattern: bool = True
-    """Solve for an error of the range that is the same in every frame, too. Off: there is none (the
-    paper preset never has one)."""
+    """An error of the range that all frames share is solved for, too. With --no-fixed-pattern there
+    is none (the paper preset never has one)."""
     prior_t: float | None = None
     """Standard deviation of the measured translations, m. None: the dataset's pose_noise, else 0.01
     (paper: no prior)."""

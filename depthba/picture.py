@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba import durable
 from depthba.clouds import FrameCloud, inside, load_clouds, point_spacing, transform
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
+from depthba.figure import colour_bar, frame_axes, new_figure, png, save, scale_bar
 from depthba.options import Options
-from depthba.result import Result
 from depthba.spread import CellSpread, cell_spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
 CELL_SPACINGS = 4.0
 """Width of a cell in point spacings: enough points for a mean, small enough for slopes."""
-EMPTY, DARK = "#e9e9ec", "#121212"
+DARK = "#121212"
 SPREADS = "inferno_r"
 SIGMAS = "YlOrRd"
 """Seen on dark ground at either end."""
@@ -44,6 +41,30 @@ HEIGHTS = (
 BEFORE, AFTER = "Before: start poses", "After: depthba"
 
 
+class Registered(Protocol):
+    """What a picture needs of a registration: a `depthba.result.Result` has it."""
+
+    @property
+    def status(self) -> str:
+        """How it ended."""
+
+    @property
+    def depth_map(self) -> DepthMap:
+        """The map after."""
+
+    @property
+    def depth_map_start(self) -> DepthMap:
+        """The map that the start poses give."""
+
+    @property
+    def T_world_camera(self) -> Floats:
+        """(N, 4, 4), estimated."""
+
+    @property
+    def T_world_camera_start(self) -> Floats:
+        """(N, 4, 4), where the registration began."""
+
+
 @dataclass(frozen=True)
 class Spreads:
     """Spread between the frames at the start poses and at the estimate."""
@@ -58,7 +79,7 @@ class Spreads:
 
 
 def spreads(
-    result: Result, dataset: Dataset, clouds: Sequence[FrameCloud], roi: Sequence[float] | None
+    result: Registered, dataset: Dataset, clouds: Sequence[FrameCloud], roi: Sequence[float] | None
 ) -> Spreads:
     """Compare the frames cell by cell, in the map frame, at the start and the estimated poses."""
     cell = CELL_SPACINGS * point_spacing(dataset, [c.points for c in clouds])
@@ -75,7 +96,7 @@ def spreads(
 
 
 def map_picture(
-    result: Result,
+    result: Registered,
     dataset: Dataset,
     path: str | Path,
     *,
@@ -87,31 +108,31 @@ def map_picture(
     Args:
         result: what to draw.
         dataset: its frames.
-        path: where to write the PNG.
+        path: where to write it, PNG or SVG by its suffix.
         options: the options of the run, for its region of interest.
         clouds: the points of all frames, where the caller has them already.
 
     """
     clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
     both = spreads(result, dataset, clouds, options.roi if options else None)
-    box = _extent(result.depth_map)
+    box = extent(result.depth_map)
     width, height = box[1] - box[0], box[3] - box[2]
     panel = np.clip(6.2 * height / width, 2.2, 7.5)
-    figure = _figure(14.5, 2 * panel + 1.6)
+    figure = new_figure(14.5, 2 * panel + 1.6)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, depth_map, title in zip(
         axes[0], (result.depth_map_start, result.depth_map), (BEFORE, AFTER), strict=True
     ):
-        relief = _draw_relief(ax, depth_map, _height_range(result))
+        relief = draw_relief(ax, depth_map, _height_range(result))
         ax.set_title(f"Map. {title}", loc="left", fontweight="bold")
-    _bar(figure, relief, axes[0], "height (m)")
+    colour_bar(figure, relief, axes[0], "height (m)")
     for ax, spread, title in zip(axes[1], (both.before, both.after), (BEFORE, AFTER), strict=True):
         image = _draw_spread(ax, spread, both.top)
         ax.set_title(f"Disagreement of frames. {title}", loc="left", fontweight="bold")
         ax.set_title(f"median {millimetres(spread.quantile(0.5))}", loc="right")
-    _bar(figure, image, axes[1], "spread of the frames' heights (mm)", extend="max")
+    colour_bar(figure, image, axes[1], "spread of the frames' heights (mm)", extend="max")
     for ax in axes.flat:
-        _frame(ax, box)
+        frame_axes(ax, box)
     for ax in axes[1]:
         ax.set_xlabel("x (m)")
     for ax in axes[:, 0]:
@@ -121,11 +142,11 @@ def map_picture(
         f"{millimetres(result.depth_map.spacing)}, {result.status.replace('_', ' ')}",
         fontsize=14,
     )
-    _save(figure, path, dpi=100)
+    save(figure, path, dpi=100)
 
 
 def before_after(
-    result: Result,
+    result: Registered,
     dataset: Dataset,
     path: str | Path,
     *,
@@ -144,23 +165,23 @@ def before_after(
     """
     clouds = load_clouds(dataset, colours=False) if clouds is None else clouds
     both = spreads(result, dataset, clouds, options.roi if options else None)
-    box = _extent(result.depth_map)
+    box = extent(result.depth_map)
     panel = np.clip(6.2 * (box[3] - box[2]) / (box[1] - box[0]), 2.4, 7.5)
-    figure = _figure(13.6, panel + 0.5)
+    figure = new_figure(13.6, panel + 0.5)
     axes = figure.subplots(1, 2)
     for ax, depth_map, spread, title in (
         (axes[0], result.depth_map_start, both.before, "Start poses"),
         (axes[1], result.depth_map, both.after, "After depthba"),
     ):
-        relief = _draw_relief(ax, depth_map, _height_range(result))
+        relief = draw_relief(ax, depth_map, _height_range(result))
         median = millimetres(spread.quantile(0.5))
         ax.set_title(f"{title}: frames disagree by {median}", fontweight="bold")
-        _frame(ax, box)
+        frame_axes(ax, box)
         ax.set_xticks([])
         ax.set_yticks([])
-        _scale_bar(ax, box)
-    _bar(figure, relief, axes, "height (m)")
-    _save(figure, path, dpi=100)
+        scale_bar(ax, box)
+    colour_bar(figure, relief, axes, "height (m)")
+    save(figure, path, dpi=100)
 
 
 def spread_png(
@@ -171,7 +192,7 @@ def spread_png(
     Where much may lie beyond ``top``, ``colours`` should not end as dark as the ground.
     """
     return _dark_png(
-        _extent(depth_map),
+        extent(depth_map),
         lambda ax: _draw_spread(ax, spread, top, colours),
         "spread between frames (mm)",
     )
@@ -209,7 +230,7 @@ def sigma_png(depth_map: DepthMap) -> bytes:
             interpolation="nearest",
         )
 
-    return _dark_png(_extent(depth_map), draw, "standard deviation of the height (mm)")
+    return _dark_png(extent(depth_map), draw, "standard deviation of the height (mm)")
 
 
 def height_colours(
@@ -271,16 +292,6 @@ def millimetres(metres: float) -> str:
     return f"{mm:.{min(max(digits, 0), 5)}f} mm"
 
 
-def _figure(width: float, height: float, ground: str = "white") -> Figure:
-    """Make a figure that needs no screen and touches none of pyplot's global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor=ground)
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _dark_png(
     box: tuple[float, float, float, float], draw: Callable[[Axes], Any], label: str
 ) -> bytes:
@@ -289,64 +300,23 @@ def _dark_png(
 
     height = float(np.clip(5.6 * (box[3] - box[2]) / (box[1] - box[0]), 2.5, 9.0))
     with style.context("dark_background"):
-        figure = _figure(7.2, height + 0.6, ground=DARK)
+        figure = new_figure(7.2, height + 0.6, ground=DARK)
         ax = figure.subplots()
-        _bar(figure, draw(ax), [ax], label, extend="max")
-        _frame(ax, box)
+        colour_bar(figure, draw(ax), [ax], label, extend="max")
+        frame_axes(ax, box)
         ax.set_facecolor(DARK)
         ax.set_xlabel("x (m)")
         ax.set_ylabel("y (m)")
-        return _png(figure, dpi=100)
+        return png(figure, dpi=100)
 
 
-def _save(figure: Figure, path: str | Path, dpi: int) -> None:
-    """Write the figure as PNG, whole or not at all."""
-    durable.write_bytes(path, _png(figure, dpi))
-
-
-def _png(figure: Figure, dpi: int) -> bytes:
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=dpi, metadata={"Software": None})
-    return out.getvalue()
-
-
-def _extent(depth_map: DepthMap) -> tuple[float, float, float, float]:
-    """Return xmin xmax ymin ymax of what was seen, metres."""
-    ys, xs = np.nonzero(np.isfinite(depth_map.heights))
-    if not len(ys):
-        ny, nx = depth_map.shape
-        ys, xs = np.array([0, ny - 1]), np.array([0, nx - 1])
-    x, y, s = *depth_map.origin, depth_map.spacing
-    return (
-        x + s * (xs.min() - 0.5),
-        x + s * (xs.max() + 0.5),
-        y + s * (ys.min() - 0.5),
-        y + s * (ys.max() + 0.5),
-    )
-
-
-def _height_range(result: Result) -> tuple[float, float]:
+def _height_range(result: Registered) -> tuple[float, float]:
     """Return the heights that the colours span, in both maps alike."""
     known = result.depth_map.heights[np.isfinite(result.depth_map.heights)]
     if not len(known):
         return 0.0, 1.0
     low, high = np.quantile(known, [0.02, 0.98])
     return float(low), float(high)
-
-
-def _draw_relief(ax: Axes, depth_map: DepthMap, span: tuple[float, float]) -> Any:
-    """Draw shaded relief; return something that a colour bar can be made of."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import ListedColormap, Normalize
-
-    ny, nx = depth_map.shape
-    x, y, s = *depth_map.origin, depth_map.spacing
-    extent = (x - 0.5 * s, x + (nx - 0.5) * s, y - 0.5 * s, y + (ny - 0.5) * s)
-    ax.imshow(
-        relief_image(depth_map, *span), extent=extent, origin="lower", interpolation="nearest"
-    )
-    ramp = height_colours(np.linspace(0.0, 1.0, 256), 0.0, 1.0) / 255.0
-    return ScalarMappable(Normalize(*span), ListedColormap(ramp.tolist()))
 
 
 def _draw_spread(ax: Axes, spread: CellSpread, top: float, colours: str = SPREADS) -> Any:
@@ -364,32 +334,29 @@ def _draw_spread(ax: Axes, spread: CellSpread, top: float, colours: str = SPREAD
     )
 
 
-def _bar(figure: Figure, mappable: Any, axes: Any, label: str, extend: str = "neither") -> None:
-    figure.colorbar(mappable, ax=list(axes), label=label, extend=extend, shrink=0.9, pad=0.01)
-
-
-def _frame(ax: Axes, box: tuple[float, float, float, float]) -> None:
-    """Fix what all panels share: the same part of the map, true proportions, a quiet ground."""
-    ax.set_facecolor(EMPTY)
-    ax.set_aspect("equal")
-    ax.set_xlim(box[0], box[1])
-    ax.set_ylim(box[2], box[3])
-
-
-def _scale_bar(ax: Axes, box: tuple[float, float, float, float]) -> None:
-    """Draw a bar of a round length in the lower left corner."""
-    width, height = box[1] - box[0], box[3] - box[2]
-    exponent = np.floor(np.log10(0.3 * width))
-    length = max(m * 10**exponent for m in (1, 2, 5) if m * 10**exponent <= 0.3 * width)
-    x, y = box[0] + 0.04 * width, box[2] + 0.05 * height
-    ax.plot([x, x + length], [y, y], color="white", lw=6, solid_capstyle="butt")
-    ax.plot([x, x + length], [y, y], color="black", lw=3, solid_capstyle="butt")
-    text = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-    ax.text(
-        x + 0.5 * length,
-        y + 0.02 * height,
-        text,
-        ha="center",
-        va="bottom",
-        bbox={"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5},
+def extent(depth_map: DepthMap) -> tuple[float, float, float, float]:
+    """Return xmin xmax ymin ymax of what was seen, metres."""
+    ys, xs = np.nonzero(np.isfinite(depth_map.heights))
+    if not len(ys):
+        ny, nx = depth_map.shape
+        ys, xs = np.array([0, ny - 1]), np.array([0, nx - 1])
+    x, y, s = *depth_map.origin, depth_map.spacing
+    return (
+        x + s * (xs.min() - 0.5),
+        x + s * (xs.max() + 0.5),
+        y + s * (ys.min() - 0.5),
+        y + s * (ys.max() + 0.5),
     )
+
+
+def draw_relief(ax: Axes, depth_map: DepthMap, span: tuple[float, float]) -> Any:
+    """Draw shaded relief; return something that a colour bar can be made of."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    ny, nx = depth_map.shape
+    x, y, s = *depth_map.origin, depth_map.spacing
+    edges = (x - 0.5 * s, x + (nx - 0.5) * s, y - 0.5 * s, y + (ny - 0.5) * s)
+    ax.imshow(relief_image(depth_map, *span), extent=edges, origin="lower", interpolation="nearest")
+    ramp = height_colours(np.linspace(0.0, 1.0, 256), 0.0, 1.0) / 255.0
+    return ScalarMappable(Normalize(*span), ListedColormap(ramp.tolist()))

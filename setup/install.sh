@@ -60,7 +60,7 @@ packages() {
         --constraint constraints.txt hatchling editables
     .venv/bin/python -m pip install --quiet --disable-pip-version-check \
         --constraint constraints.txt --no-build-isolation \
-        --editable '.[sim,eval,rig,cameras,convert,distributed,dev]'
+        --editable '.[sim,eval,rig,cameras,convert,distributed,docs,dev]'
 }
 
 system_libraries

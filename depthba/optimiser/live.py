@@ -85,7 +85,7 @@ class Registration:
             options: how; ``init`` is of no account. The defaults where None.
             map_frame: ``auto`` (faces the first frame's view) or ``world``.
             pose_noise: standard deviations of the measured poses; None: the usual ones.
-            cancel: see :func:`depthba.register`.
+            cancel: see `depthba.register`.
 
         Raises:
             OptionError: an option makes no sense.

@@ -39,7 +39,7 @@ def register(
         options: how; the defaults where None.
         callback: called after every iteration.
         cancel: asked many times a second, also while a step is worked out; when it answers True,
-            the registration ends with :class:`Cancelled`. ``threading.Event().is_set`` does.
+            the registration ends with `Cancelled`. ``threading.Event().is_set`` does.
 
     Returns:
         Poses, map, covariance and history. ``result.trusted`` says whether to rely on it.

@@ -6,10 +6,18 @@ import contextlib
 import dataclasses
 import inspect
 import io
-from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_type_hints
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import docstring_parser
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from depthba.errors import OptionError
 
@@ -36,10 +44,7 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
         OptionError: the file behind ``--config`` has an unknown key or a wrong value.
         OSError: that file cannot be read.
     """
-    config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
-    with_config: Any = dataclasses.make_dataclass(
-        kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
-    )
+    with_config = _with_config(kind)
     path = _config_path(words)
     default = None if path is None else _with_defaults(with_config, _read(path, kind))
     parsed: Any = tyro.cli(
@@ -49,21 +54,101 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
         description=inspect.cleandoc(kind.__doc__ or ""),
         default=default,
         config=_STYLE,
+        registry=_FORMS,
     )
     values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(with_config)}
     del values["config"]
     return kind(**values)
 
 
+def completion(kinds: Mapping[str, type[Any]], prog: str, shell: str) -> str:
+    """Return the script with which a shell completes a command of several verbs.
+
+    Args:
+        kinds: by verb, the dataclass of its arguments.
+        prog: the command.
+        shell: bash, zsh or fish.
+    """
+    verbs = tuple(
+        Annotated[_with_config(kind), tyro.conf.subcommand(name)] for name, kind in kinds.items()
+    )
+    both: Any = Union[verbs]  # noqa: UP007 (of a tuple, which has no other form)
+    words = ["--tyro-print-completion", shell]
+    out = io.StringIO()
+    # tyro ends the process once it has printed
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        tyro.cli(both, prog=prog, args=words, config=_STYLE, registry=_FORMS)
+    return out.getvalue()
+
+
+def _with_config(kind: type[Any]) -> Any:
+    """Return the dataclass with the option --config beside its own."""
+    _joined_help(kind)
+    config_type = Annotated[str | None, tyro.conf.arg(metavar="FILE", help=_CONFIG_HELP)]
+    return dataclasses.make_dataclass(
+        kind.__name__, [("config", config_type, None)], bases=(kind,), frozen=True
+    )
+
+
+def _joined_help(kind: type[Any]) -> None:
+    """Give the fields of a dataclass, and of those in it, their docstrings as one line each.
+
+    tyro keeps the line breaks of a docstring, which would fall anywhere on a line of a terminal.
+    """
+    told: dict[str, str] = {}
+    for one in reversed(kind.__mro__[:-1]):
+        for param in docstring_parser.parse_from_object(one).params:
+            told[param.arg_name] = " ".join((param.description or "").split())
+    hints = get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        if group := _group(hints[field.name]):
+            _joined_help(group)
+        elif told.get(field.name):
+            field.metadata = MappingProxyType({**field.metadata, "help": told[field.name]})
+
+
 def known_keys(kind: type[Any]) -> dict[str, Any]:
     """Return the keys that a configuration file may have for a dataclass, with their types."""
     keys: dict[str, Any] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            keys |= known_keys(hint)
+        if group := _group(hint):
+            keys |= known_keys(group)
         else:
             keys[name] = hint
     return keys
+
+
+def _group(hint: Any) -> type[Any] | None:
+    """Return the dataclass behind a hint, with or without a note on it; None: it is none."""
+    bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    return bare if isinstance(bare, type) and dataclasses.is_dataclass(bare) else None
+
+
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let the help of ``X | None`` read as that of X; None can still be given as a word."""
+    if get_origin(info.type) not in (Union, UnionType):
+        return None
+    members = [member for member in get_args(info.type) if member is not NoneType]
+    if len(members) != 1 or len(get_args(info.type)) != 2 or get_origin(members[0]) is Literal:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(members[0], info.markers))
+    if isinstance(inner, UnsupportedTypeAnnotationError) or not isinstance(inner.nargs, int):
+        return None
+
+    def read(words: list[str]) -> Any:
+        return None if words == ["None"] else inner.instance_from_str(words)
+
+    return dataclasses.replace(
+        inner,
+        nargs=1 if inner.nargs == 1 else (inner.nargs, 1),
+        instance_from_str=read,
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda v: ["None"] if v is None else inner.str_from_instance(v),
+    )
+
+
+_FORMS = ConstructorRegistry()
+_FORMS.primitive_rule(_optional)
 
 
 def _config_path(words: Sequence[str]) -> str | None:
@@ -122,8 +207,8 @@ def _with_defaults(kind: type[Any], values: dict[str, Any]) -> Any:
     hints = get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            filled[field.name] = _with_defaults(hint, values)
+        if group := _group(hint):
+            filled[field.name] = _with_defaults(group, values)
         elif field.name in values:
             filled[field.name] = values[field.name]
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:

@@ -78,8 +78,8 @@ class Arguments:
     """Replace DST where it is a file."""
     json: bool = False
     """Print one JSON object on stdout in place of text."""
-    choice: Choice = field(default_factory=Choice)
-    reading: Reading = field(default_factory=Reading)
+    choice: Annotated[Choice, tyro.conf.arg(name="selection")] = field(default_factory=Choice)
+    reading: Annotated[Reading, tyro.conf.arg(name="source")] = field(default_factory=Reading)
 
 
 def run(arguments: Arguments) -> int:

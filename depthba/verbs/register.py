@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from depthba.convert import Reading
-from depthba.errors import MissingPackage, OptionError
+from depthba.errors import DatasetError, MissingPackage, OptionError
 from depthba.options import Options
 from depthba.verbs import DONE, NOT_TO_BE_TRUSTED, WRONG_USAGE
 from depthba.verbs.output import angle, length, note, print_json
@@ -38,7 +38,7 @@ class Arguments:
     dataset: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of the dataset; or a source of another format, as `depthba convert` takes it, which
     becomes the folder dataset of the run."""
-    out: Path | None = None
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder for the run, new or empty. None: logs/<name>-<yyyymmdd-hhmmss>."""
     overwrite: bool = False
     """Write into the folder even where it holds an earlier run."""
@@ -48,8 +48,8 @@ class Arguments:
     """Open the viewer at once, and show every step as it comes."""
     web: bool = False
     """With --live: serve to a browser, on 127.0.0.1 alone, in place of opening a window."""
-    options: Options = field(default_factory=Options)
-    reading: Reading = field(default_factory=Reading)
+    options: Annotated[Options, tyro.conf.arg(name="registration")] = field(default_factory=Options)
+    reading: Annotated[Reading, tyro.conf.arg(name="source")] = field(default_factory=Reading)
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,12 @@ def run(arguments: Arguments) -> int:
     with contextlib.ExitStack() as stack:
         out, overwrite, options = arguments.out, arguments.overwrite, arguments.options
         source = arguments.dataset
-        if source.exists() and not (source / "dataset.json").exists():
+        if not source.exists():
+            raise DatasetError(
+                f"{source}: no such file or folder, expected a dataset, or a source that "
+                "`depthba convert --list` names"
+            )
+        if not (source / "dataset.json").exists():
             out = default_path(source.stem) if out is None else out
             stack.enter_context(removed_on_failure(out, overwrite))
             dataset = _imported(arguments, out)

@@ -80,7 +80,7 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
     ("words", "status", "told"),
     [
         ([], 2, "usage: depthba VERB"),
-        (["fly"], 2, "no verb 'fly'; choose from: demo, generate"),
+        (["fly"], 2, "no verb 'fly'; the verbs are: demo, generate"),
         (["register"], 2, "DATASET"),
         (["register", ".", "--preset", "best"], 2, "invalid choice 'best'"),
         (["register", "/no/such/folder"], 1, "depthba: error: /no/such/folder"),

@@ -29,9 +29,11 @@ def read(path: Path, reading: Reading) -> Recording:
         suffixes = " ".join(files.DEPTH_SUFFIXES)
         raise DatasetError(f"{path}: no depth images in it or in depth/, expected {suffixes}")
     if reading.depth_scale is None:
+        told = reading.intrinsics or any((path / name).is_file() for name in intrinsics.NAMES)
+        lens = "" if told else ", and --intrinsics FX FY CX CY of the depth images, pixels"
         raise DatasetError(
             f"{path}: a folder of images does not say the unit of depth, expected --depth-scale "
-            "METRES a step, such as 0.001 for mm"
+            f"METRES a step, such as 0.001 for mm{lens}"
         )
     poses = pose_files.read(Path(reading.poses) if reading.poses else _poses_in(path))
     camera = intrinsics.camera_of(path, found[0], reading)

@@ -1,0 +1,1 @@
+"""Pictures of finished runs, for reports: one module a kind, each drawn from the plain files."""
