@@ -9,7 +9,7 @@ from depthba import se3
 from depthba.optimiser import certainty
 from depthba.optimiser.engine import End, Engine
 from depthba.optimiser.grid import average, filled
-from depthba.optimiser.linearise import State, linearise
+from depthba.optimiser.linearise import State, linearise, robust_sigma
 from depthba.optimiser.reporting import depth_map, frame_reports, verdict
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import solve_map
@@ -55,13 +55,16 @@ def conclude(
     if outcome.tied is not None:
         cost_start += outcome.tied.patches.fitted(T_camera_start, workers).cost
         cost_end += outcome.tied.cost
-    better = cost_end <= cost_start
+    # where no frame moves, the poses are the start's, whatever rounding makes of the two costs
+    better = cost_end <= cost_start or not engine.free.any()
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")
     found = end.known if better else None
     found = found or engine.known_at(level, state, outcome.loss)
     firm, firm_lin, known = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
+    # where no point may vouch for the map, all must; and none is better than its last digit
+    sigma = max(sigma or robust_sigma(lin.residuals), problem.rounding)
     variance, inflation = known.inflation * sigma**2, max(known.inflation, known.overall)
     held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
     S, _ = without_slope_noise(

@@ -327,6 +327,8 @@ class Engine:
             return None
         now = np.zeros(len(problem.waves)) if self.bend is None else self.bend
         variance = robust_sigma(lin.residuals) ** 2
+        if not variance:  # no point is left to ask: the map bends sharply everywhere
+            return None
         matrix, _ = self.acting.normal_equations(state.T_map_camera, lin.pivots)
         # where the level ended data and measured poses balance: no gradient is left
         held, none = at.S + variance * matrix, np.zeros(len(at.S))

@@ -47,6 +47,8 @@ def held_frames(problem: Problem, overlap: NDArray[np.float64]) -> list[str]:
         others = np.delete(np.minimum(overlap[i], 1.0), i)
         if i == 0:
             reasons.append("first frame: fixes the coordinate system")
+        elif frame.refused:
+            reasons.append(frame.refused)
         elif len(frame) < FEWEST:
             reasons.append(f"{len(frame)} points, fewer than {FEWEST}")
         elif others.max(initial=0.0) < LEAST:

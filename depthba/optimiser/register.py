@@ -18,6 +18,7 @@ from depthba.optimiser.grid import make_grid
 from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import pose_prior
 from depthba.optimiser.problem import prepare
+from depthba.optimiser.solvable import solvable
 from depthba.optimiser.start import pose_sigmas, start_poses
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
@@ -46,6 +47,7 @@ def register(
     Raises:
         DatasetError: the dataset is damaged, or has fewer than two frames with points.
         OptionError: an option makes no sense.
+        Unsolvable: lengths are such that the equations cannot be solved.
         Cancelled: ``cancel`` said so.
     """
     options = options or Options()
@@ -83,6 +85,7 @@ def _register(
     )
     clock.lap("prepare")
     engine = Engine(problem, options, prior, free, workers, clock, callback)
-    end = engine.run(levels, problem.T_map_camera)
     ids, stamps = tuple(f.id for f in dataset), tuple(f.stamp for f in dataset)
-    return conclude(engine, end, ids, stamps, start, held, overlap)
+    with solvable(problem, str(dataset.path)):
+        end = engine.run(levels, problem.T_map_camera)
+        return conclude(engine, end, ids, stamps, start, held, overlap)
