@@ -10,7 +10,7 @@ from depthba.optimiser import certainty
 from depthba.optimiser.engine import End, Engine
 from depthba.optimiser.grid import average, filled
 from depthba.optimiser.linearise import State, linearise, robust_sigma
-from depthba.optimiser.reporting import depth_map, frame_reports, verdict
+from depthba.optimiser.reporting import astray, depth_map, frame_reports, misfits, verdict
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import solve_map
 from depthba.result import Result
@@ -27,6 +27,7 @@ def conclude(
     start: NDArray[np.float64],
     held: list[str],
     overlap: NDArray[np.float64],
+    stated: bool,
 ) -> Result:
     """Compare with the start, say how certain the outcome is, and put the result together.
 
@@ -38,6 +39,7 @@ def conclude(
         start: (N, 4, 4) T_world_camera.
         held: per frame, why it did not move; empty where it did.
         overlap: (N, N).
+        stated: whether the measured poses' deviations were stated, and not only supposed.
     """
     problem, level, outcome, workers = engine.problem, end.level, end.outcome, engine.workers
     prior, T_camera_start = engine.prior, engine.problem.T_map_camera
@@ -77,7 +79,9 @@ def conclude(
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
-    status, reason = verdict(outcome, better, judged, frames, engine.clock)
+    gone = astray(ids, prior.distances(state.T_map_camera), engine.preset.prior, stated)
+    gone += misfits(frames) if better and engine.preset.robust else []
+    status, reason = verdict(outcome, better, judged, frames, gone, engine.clock)
     T_world_map = se3.inverse(problem.T_map_world)
     return Result(
         status=status,

@@ -100,6 +100,10 @@ class Registration:
             check_roi(self.options.roi)
         self._sensor, self._map_frame = sensor, map_frame
         self._sigmas = pose_sigmas(pose_noise, self.options)
+        self._stated = pose_noise is not None or None not in (
+            self.options.prior_t,
+            self.options.prior_r,
+        )
         self._workers = Workers(self.options.threads or os.cpu_count() or 1, cancel)
         self._ids: list[int] = []
         self._digests: dict[bytes, int] = {}
@@ -200,7 +204,9 @@ class Registration:
         with solvable(problem, f"{len(self)} frames"):
             end = engine.run(levels, np.stack(self._T_map_camera), refining=True)
             ids, stamps = tuple(self._ids), tuple(self._stamps)
-            result = conclude(engine, end, ids, stamps, measured, held, overlap)
+            result = conclude(
+                engine, end, ids, stamps, measured, held, overlap, self._stated
+            )
         self._T_map_camera = list(end.outcome.state.T_map_camera)
         return result
 

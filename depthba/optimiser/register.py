@@ -85,7 +85,8 @@ def _register(
     )
     clock.lap("prepare")
     engine = Engine(problem, options, prior, free, workers, clock, callback)
+    stated = dataset.pose_noise is not None or None not in (options.prior_t, options.prior_r)
     ids, stamps = tuple(f.id for f in dataset), tuple(f.stamp for f in dataset)
     with solvable(problem, str(dataset.path)):
         end = engine.run(levels, problem.T_map_camera)
-        return conclude(engine, end, ids, stamps, start, held, overlap)
+        return conclude(engine, end, ids, stamps, start, held, overlap, stated)

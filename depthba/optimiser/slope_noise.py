@@ -99,8 +99,10 @@ def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
     own = np.maximum(np.diag(whole), 1e-12 * np.max(np.diag(whole), initial=1e-300))
     root = np.sqrt(own)  # of each: products of tiny ones would be nothing
     scaled = whole / np.outer(root, root)
-    lowest = float(np.linalg.eigvalsh(scaled)[0])
-    return np.asarray(whole + max(1e-9 - lowest, 0.0) * np.diag(own))
+    values = np.linalg.eigvalsh(scaled)
+    # rows that are next to nothing beside what couples them to others make for large values
+    least = max(1e-9, 1e-12 * float(values[-1]))
+    return np.asarray(whole + max(least - float(values[0]), 0.0) * np.diag(own))
 
 
 def _less(
