@@ -204,9 +204,7 @@ class Registration:
         with solvable(problem, f"{len(self)} frames"):
             end = engine.run(levels, np.stack(self._T_map_camera), refining=True)
             ids, stamps = tuple(self._ids), tuple(self._stamps)
-            result = conclude(
-                engine, end, ids, stamps, measured, held, overlap, self._stated
-            )
+            result = conclude(engine, end, ids, stamps, measured, held, overlap, self._stated)
         self._T_map_camera = list(end.outcome.state.T_map_camera)
         return result
 
