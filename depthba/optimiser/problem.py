@@ -262,7 +262,7 @@ def typical_noise(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
 
 
 def _sigmas(noise: RangeNoise, points: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the stated standard deviation of each point's range (n,), m, but no less than rounding.
+    """Return the stated deviation of each point's range (n,), m, no less than its rounding.
 
     Raises:
         DatasetError: it is no number at some point.

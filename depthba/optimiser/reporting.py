@@ -16,7 +16,6 @@ from depthba.optimiser.problem import Problem
 from depthba.optimiser.solver import Outcome, Progress
 from depthba.result import FrameReport, Iteration, Status
 
-
 # Standard deviations of a measured pose, as they were stated and as they are supposed where nobody
 # stated any, beyond which pose and points contradict each other.
 FAR, FAR_SUPPOSED = 10.0, 25.0
