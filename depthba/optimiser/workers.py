@@ -89,8 +89,11 @@ class Workers:
         ]
 
     def bands(self, rows: int) -> list[tuple[int, int]]:
-        """Deal the rows of a grid out: first row and the one past the last."""
-        count = max(1, min(self.threads, rows // LEAST_ROWS))
+        """Deal the rows of a grid out: first row and the one past the last.
+
+        As many whatever the number of threads, as with :meth:`shares`.
+        """
+        count = max(1, min(SHARES, rows // LEAST_ROWS))
         ends = [rows * k // count for k in range(count + 1)]
         return list(pairwise(ends))
 
