@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from depthba.optimiser import coupling, pattern, probes, reduced
+from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
@@ -126,6 +127,7 @@ def correlation(
     variance = max(robust_sigma(lin.residuals), problem.rounding) ** 2
     factor = 1.0
     for _ in range(10):
+        look()
         V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, max(spread[0], spread[-1]) / max(spread[1], 1e-300))

@@ -17,6 +17,7 @@ from depthba.dataset.listing import STAMP_TOLERANCE
 from depthba.dataset.sensor import PoseNoise
 from depthba.errors import DatasetError
 from depthba.optimiser import schedule
+from depthba.optimiser.asking import listening
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
 from depthba.optimiser.engine import PASSING, Engine
@@ -104,6 +105,7 @@ class Registration:
             self.options.prior_t,
             self.options.prior_r,
         )
+        self._cancel = cancel
         self._workers = Workers(self.options.threads or os.cpu_count() or 1, cancel)
         self._ids: list[int] = []
         self._digests: dict[bytes, int] = {}
@@ -139,6 +141,20 @@ class Registration:
             Unsolvable: lengths are such that the equations cannot be solved.
             Cancelled: ``cancel`` said so; the frame was not taken.
         """
+        with listening(self._cancel):
+            return self._add(frame)
+
+    def result(self) -> Result:
+        """Settle all frames on the finest map and judge the outcome.
+
+        Raises:
+            DatasetError: fewer than two frames have points.
+            Cancelled: ``cancel`` said so.
+        """
+        with listening(self._cancel):
+            return self._result()
+
+    def _add(self, frame: Frame) -> Update:
         began = time.perf_counter()
         self._check(frame)
         cloud = points_of(frame)
@@ -185,13 +201,7 @@ class Registration:
             seconds=time.perf_counter() - began,
         )
 
-    def result(self) -> Result:
-        """Settle all frames on the finest map and judge the outcome.
-
-        Raises:
-            DatasetError: fewer than two frames have points.
-            Cancelled: ``cancel`` said so.
-        """
+    def _result(self) -> Result:
         if sum(len(f) > 0 for f in self._frames) < 2:
             raise DatasetError("registration needs 2 or more frames with valid depth")
         measured = np.stack(self._T_world_measured)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import make_grid
 from depthba.optimiser.problem import Problem
 
@@ -26,6 +27,7 @@ def overlap_matrix(
     grid = make_grid(problem, max(spacing, 4 * problem.spacing), 0.0)
     seen = np.zeros((len(problem.frames), grid.shape[0] * grid.shape[1]), np.float32)
     for i, (frame, T) in enumerate(zip(problem.frames, T_map_camera, strict=True)):
+        look()
         n = np.zeros(grid.shape)
         unused = np.zeros(grid.shape)
         map_kernels.splat(

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import patch_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import SHARES, Workers
 
@@ -301,6 +302,7 @@ def lay(
     patch: Ints = np.full(len(x), -1)
     axes, centre, size, total = [], [], [], 0
     for side in sides:
+        look()
         if not len(left):
             break
         of, V, c = _voxels(x[left], cloud.weights[left], cloud.frame[left], n, side)

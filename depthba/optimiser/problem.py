@@ -13,6 +13,7 @@ from depthba import se3
 from depthba.camera import RangeNoise
 from depthba.dataset import Dataset, Frame, Sensor
 from depthba.errors import DatasetError, OptionError
+from depthba.optimiser.asking import look
 from depthba.optimiser.waves import Waves, waves_of
 
 Roi = tuple[float, float, float, float, float, float]
@@ -152,6 +153,7 @@ def points_of(frame: Frame) -> NDArray[np.float32]:
     Raises:
         DatasetError: a file is damaged, or the camera's intrinsics send points to infinity.
     """
+    look()
     with np.errstate(over="ignore"):
         points = frame.points()
     if not np.isfinite(points).all():
@@ -283,6 +285,7 @@ def _sigmas(noise: RangeNoise, points: NDArray[np.float32]) -> NDArray[np.float6
 
 def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) -> FramePoints:
     """Wrap a cloud (n, 3) in the sensor frame; ``typical`` noise, m, gets the weight 1."""
+    look()
     n = len(points)
     if n == 0:
         return FramePoints(

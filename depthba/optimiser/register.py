@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from depthba.dataset import Dataset
 from depthba.optimiser import schedule
+from depthba.optimiser.asking import listening
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
 from depthba.optimiser.engine import Engine
@@ -58,7 +59,8 @@ def register(
     clock = Clock(options.time_limit)
     workers = Workers(options.threads or os.cpu_count() or 1, cancel)
     try:
-        return _register(dataset, options, callback or (lambda _: None), clock, workers)
+        with listening(cancel):
+            return _register(dataset, options, callback or (lambda _: None), clock, workers)
     finally:
         workers.close()
 
