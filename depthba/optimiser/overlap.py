@@ -35,6 +35,7 @@ def overlap_matrix(
         )
         seen[i] = (n > 0).ravel()
     cells = seen.sum(axis=1)
+    look()
     return np.asarray((seen @ seen.T) / np.maximum(cells, 1)[:, None], dtype=float)
 
 

@@ -358,6 +358,7 @@ def _voxels(
     key = ((cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]) * frames + frame
     order = np.argsort(key, kind="stable")
     sorted_key = key[order]
+    look()
     first = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
     view = np.cumsum(first) - 1
     where = sorted_key[first] // frames
@@ -368,6 +369,7 @@ def _voxels(
     patch_kernels.moments(order, view, x, weights, count, weight, mean, spread)
     many = count >= FEWEST
     on = voxel[many]
+    look()
     pooled = np.zeros((k, 3, 3))
     np.add.at(pooled, on, spread[many])
     total = np.bincount(on, weight[many], k)
