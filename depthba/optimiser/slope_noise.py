@@ -96,7 +96,9 @@ def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
 
     The floor is relative to each unknown's own scale, and above what rounding leaves below zero.
     """
-    own = np.maximum(np.diag(whole), 1e-12 * np.max(np.diag(whole), initial=1e-300))
+    # where next to nothing is known, rounding may have left less than nothing on the diagonal
+    own = np.abs(np.diag(whole))
+    own = np.maximum(own, 1e-12 * np.max(own, initial=1e-300))
     root = np.sqrt(own)  # of each: products of tiny ones would be nothing
     scaled = whole / np.outer(root, root)
     values = np.linalg.eigvalsh(scaled)
