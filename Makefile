@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/set-up
 
-.PHONY: help setup demo docs test lint format bench screenshots clean
+.PHONY: help setup demo docs test lint format bench golden screenshots clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ format: $(STAMP)  ## let ruff put the code into its form
 
 bench: $(STAMP)  ## the benchmarks
 	@$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+golden: $(STAMP)  ## solve the small problems anew whose answers are kept for every version
+	@$(BIN)/python -m tests.golden.problems
 
 screenshots: $(STAMP)  ## the pictures in docs/; needs chromium, xvfb, mesa-vulkan-drivers
 	@$(BIN)/python docs/plot_pictures.py

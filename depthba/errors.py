@@ -28,5 +28,9 @@ class OutOfReach(DepthbaError):
     """An arm cannot take a pose, or cannot come there on the way asked for."""
 
 
+class Unsolvable(DepthbaError):
+    """The equations have no solution in double precision: lengths that no scene has, as a rule."""
+
+
 class Cancelled(DepthbaError):
     """The caller asked to stop; nothing was returned or written."""

@@ -12,8 +12,9 @@ from depthba.depth_map import DepthMap
 
 Status = Literal["converged", "not_converged", "weak", "no_better"]
 """``converged``: done, to be trusted. ``not_converged``: stopped at a limit. ``weak``: done, but
-the data leave a direction of motion or a frame open, which was held at its measured pose.
-``no_better``: nothing better than the start was found, and the start poses are returned."""
+the data leave a direction of motion or a frame open, which was held at its measured pose; or a
+frame does not fit the map, or lies where its measured pose cannot be meant. ``no_better``: nothing
+better than the start was found, and the start poses are returned."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.problem import Problem
 
@@ -42,6 +43,7 @@ def without_bends(
     sharp = binary_dilation(bend > sharp_from * grid.spacing, np.ones((3, 3), bool))
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
+        look()
         xy = frame.points[:, :3] @ T[:2, :3].T + T[:2, 3]
         k = np.rint((xy - grid.origin) / grid.spacing).astype(int)
         x, y = np.clip(k, 0, [grid.shape[1] - 1, grid.shape[0] - 1]).T

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from depthba.optimiser import coupling, pattern, probes, reduced
+from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
 from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
+from depthba.optimiser.slope_noise import firm
 from depthba.optimiser.workers import Workers
 from depthba.result import WeakDirection
 
@@ -101,7 +103,7 @@ def correlation(
     keep = np.repeat(free, 6)
     if not keep.any():
         return Correlation(1.0, 1.0, S, 0.0, np.zeros((1, len(S))))
-    inner = S[np.ix_(keep, keep)]
+    inner = firm(S[np.ix_(keep, keep)])
     P = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
     rng = np.random.default_rng(0)
@@ -122,9 +124,10 @@ def correlation(
         scores = scores + patches.scores(state.T_map_camera, lin.pivots, groups, count, workers)
     scores = scores[..., keep]
     scores = scores - scores.mean(axis=1, keepdims=True)
-    variance = robust_sigma(lin.residuals) ** 2
+    variance = max(robust_sigma(lin.residuals), problem.rounding) ** 2
     factor = 1.0
     for _ in range(10):
+        look()
         V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
         spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
         factor = max(1.0, max(spread[0], spread[-1]) / max(spread[1], 1e-300))
@@ -167,7 +170,7 @@ def beyond_scalar(
     blocks, d = scores.shape
     expected = variance * S
     expected = expected + np.diag(1e-6 * np.diag(expected) + 1e-300)
-    root = np.linalg.cholesky(expected)
+    root = np.linalg.cholesky(firm(expected))
     white = np.linalg.solve(root, scores.T)
     values, vectors = eigh(white @ white.T)
     above = values > (1 + np.sqrt(d / blocks)) ** 2

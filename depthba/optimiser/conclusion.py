@@ -10,8 +10,8 @@ from depthba.optimiser import certainty
 from depthba.optimiser.ending import Known, known_at
 from depthba.optimiser.engine import End, Engine
 from depthba.optimiser.grid import average, filled
-from depthba.optimiser.linearise import State, linearise
-from depthba.optimiser.reporting import depth_map, frame_reports, verdict
+from depthba.optimiser.linearise import State, linearise, robust_sigma
+from depthba.optimiser.reporting import astray, depth_map, frame_reports, misfits, verdict
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import solve_map
 from depthba.result import Result
@@ -29,6 +29,7 @@ def conclude(
     start: NDArray[np.float64],
     held: list[str],
     overlap: NDArray[np.float64],
+    stated: bool,
 ) -> Result:
     """Compare with the start, say how certain the outcome is, and put the result together.
 
@@ -41,6 +42,7 @@ def conclude(
         start: (N, 4, 4) T_world_camera.
         held: per frame, why it did not move; empty where it did.
         overlap: (N, N).
+        stated: whether the measured poses' deviations were stated, and not only supposed.
     """
     problem, level, outcome, workers = engine.problem, end.level, end.outcome, engine.workers
     prior, T_camera_start = engine.prior, engine.problem.T_map_camera
@@ -58,13 +60,16 @@ def conclude(
     if outcome.tied is not None:
         cost_start += outcome.tied.patches.fitted(T_camera_start, workers).cost
         cost_end += outcome.tied.cost
-    better = cost_end <= cost_start
+    # where no frame moves, the poses are the start's, whatever rounding makes of the two costs
+    better = cost_end <= cost_start or not engine.free.any()
     state, lin = (outcome.state, outcome.lin) if better else (began, began_lin)
     engine.clock.lap("compare with the start")
     found = known if better else None
     found = found or known_at(engine, level, state, outcome.loss)
     firm, firm_lin, correlation = found.problem, found.lin, found.correlation
     sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
+    # where no point may vouch for the map, all must; and none is better than its last digit
+    sigma = max(sigma or robust_sigma(lin.residuals), problem.rounding)
     variance, inflation = correlation.inflation * sigma**2, found.inflation
     held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
     S, _ = without_slope_noise(
@@ -77,7 +82,9 @@ def conclude(
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
-    status, reason = verdict(outcome, better, judged, frames, engine.clock)
+    gone = astray(ids, prior.distances(state.T_map_camera), engine.preset.prior, stated)
+    gone += misfits(frames) if better and engine.preset.robust else []
+    status, reason = verdict(outcome, better, judged, frames, gone, engine.clock)
     T_world_map = se3.inverse(problem.T_map_world)
     return Result(
         status=status,

@@ -125,6 +125,8 @@ def _believed(
         return None
     now = np.zeros(len(waves)) if engine.bend is None else engine.bend
     variance = robust_sigma(lin.residuals) ** 2
+    if not variance:  # no point is left to ask: the map bends sharply everywhere
+        return None
     matrix, _ = engine.acting.normal_equations(state.T_map_camera, lin.pivots)
     found = pattern.answers(problem, grid, state, loss, lin, at, waves, engine.workers)
     believed = pattern.believe(

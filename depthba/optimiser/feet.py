@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import kernels, map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Loss, State, fronts_of
 from depthba.optimiser.problem import Problem
@@ -72,6 +73,7 @@ class Ground:
 
     def feet(self, i: int, stride: int = 1) -> Feet:
         """Return where every ``stride``-th point of frame ``i`` meets the map."""
+        look()
         points = np.ascontiguousarray(self.problem.frames[i].points[::stride])
         T = self.state.T_map_camera[i]
         rows = np.empty((kernels.ROWS, len(points)))

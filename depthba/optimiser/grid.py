@@ -10,6 +10,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinat
 
 from depthba.errors import OptionError
 from depthba.optimiser import map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.problem import Problem
 
 # Above this the map alone would need gigabytes: more likely a spacing in the wrong unit.
@@ -55,6 +56,7 @@ def average(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
     """Average the points' heights node by node, as the paper initialises its map."""
     total, count = np.zeros(grid.shape), np.zeros(grid.shape)
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
+        look()
         map_kernels.splat(
             frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, total, count
         )

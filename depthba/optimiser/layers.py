@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid, average, filled, make_grid
 from depthba.optimiser.problem import Problem
 
@@ -79,6 +80,7 @@ def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
     )
     squares, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
+        look()
         total, square, count = (np.zeros(grid.shape) for _ in range(3))
         map_kernels.splat_residuals(
             frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes,
@@ -94,6 +96,7 @@ def _look_up(
     field: NDArray[np.float64], xy: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.float64]:
     """Return the field's value at the node nearest to each point; 1 off the grid."""
+    look()
     k = np.rint((xy - grid.origin) / grid.spacing).astype(int)
     on = ((k >= 0) & (k < [grid.shape[1], grid.shape[0]])).all(axis=1)
     out = np.ones(len(xy))

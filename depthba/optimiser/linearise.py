@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import kernels, map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.stencil import Stencil
@@ -158,6 +159,7 @@ def linearise(
     def share(frames: range, total: NDArray[np.float64]) -> None:
         total.fill(0.0)
         for i in frames:
+            look()
             B[i].values.fill(0.0)
             pose = state.T_map_camera[i]
             costs[i] = kernels.accumulate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.dataset import Frame, Sensor
+from depthba.dataset.listing import STAMP_TOLERANCE
 from depthba.dataset.sensor import PoseNoise
 from depthba.errors import DatasetError
 from depthba.optimiser import schedule
+from depthba.optimiser.asking import listening
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
 from depthba.optimiser.ending import gone_on
@@ -30,8 +33,11 @@ from depthba.optimiser.problem import (
     crop,
     frame_points,
     point_spacing,
+    points_of,
+    repeat_reason,
     typical_noise,
 )
+from depthba.optimiser.solvable import solvable
 from depthba.optimiser.start import pose_sigmas
 from depthba.optimiser.waves import waves_of
 from depthba.optimiser.workers import Workers
@@ -96,8 +102,14 @@ class Registration:
             check_roi(self.options.roi)
         self._sensor, self._map_frame = sensor, map_frame
         self._sigmas = pose_sigmas(pose_noise, self.options)
+        self._stated = pose_noise is not None or None not in (
+            self.options.prior_t,
+            self.options.prior_r,
+        )
+        self._cancel = cancel
         self._workers = Workers(self.options.threads or os.cpu_count() or 1, cancel)
         self._ids: list[int] = []
+        self._digests: dict[bytes, int] = {}
         self._stamps: list[float] = []
         self._clouds: list[NDArray[np.float32]] = []
         self._frames: list[FramePoints] = []
@@ -122,14 +134,35 @@ class Registration:
     def add(self, frame: Frame) -> Update:
         """Take one more frame.
 
+        A frame that repeats an earlier one to the last digit stays where it was measured.
+
         Raises:
-            DatasetError: the frame is damaged, its id is taken, or the first has no points.
+            DatasetError: the frame is damaged or of another sensor, its id or stamp is taken, its
+                pose is none, or the first has no points.
+            Unsolvable: lengths are such that the equations cannot be solved.
             Cancelled: ``cancel`` said so; the frame was not taken.
         """
+        with listening(self._cancel):
+            return self._add(frame)
+
+    def result(self) -> Result:
+        """Settle all frames on the finest map and judge the outcome.
+
+        Raises:
+            DatasetError: fewer than two frames have points.
+            Cancelled: ``cancel`` said so.
+        """
+        with listening(self._cancel):
+            return self._result()
+
+    def _add(self, frame: Frame) -> Update:
         began = time.perf_counter()
-        if frame.id in self._ids:
-            raise DatasetError(f"frame {frame.id} was added before")
-        cloud = frame.points()
+        self._check(frame)
+        cloud = points_of(frame)
+        digest = hashlib.sha256(cloud.tobytes()).digest()
+        earlier = self._digests.get(digest) if len(cloud) else None
+        if earlier is not None:
+            cloud = cloud[:0]
         if not self._ids:
             if not len(cloud):
                 raise DatasetError(f"frame {frame.id}: the first frame has no valid depth")
@@ -143,6 +176,8 @@ class Registration:
         if self.options.roi is not None:
             cloud = crop(cloud, T, self.options.roi)
         points = frame_points(cloud, self._sensor, self._typical)
+        if earlier is not None:
+            points = replace(points, refused=repeat_reason(earlier))
         clouds, frames = [*self._clouds, cloud], [*self._frames, points]
         poses = np.stack([*self._T_map_camera, T])
         worlds = np.stack([*self._T_world_measured, frame.T_world_camera])
@@ -150,8 +185,10 @@ class Registration:
         overlap = overlap_matrix(problem, poses, problem.spacing)
         held = held_frames(problem, overlap)
         if len(frames) > 1 and not held[-1]:
-            poses = self._placed(problem, poses, overlap)
-            poses = self._settled(problem, poses, held)
+            with solvable(problem, f"frame {frame.id}"):
+                poses = self._placed(problem, poses, overlap)
+                poses = self._settled(problem, poses, held)
+        self._digests.setdefault(digest, frame.id)
         self._ids.append(frame.id)
         self._stamps.append(frame.stamp)
         self._clouds, self._frames = clouds, frames
@@ -165,13 +202,7 @@ class Registration:
             seconds=time.perf_counter() - began,
         )
 
-    def result(self) -> Result:
-        """Settle all frames on the finest map and judge the outcome.
-
-        Raises:
-            DatasetError: fewer than two frames have points.
-            Cancelled: ``cancel`` said so.
-        """
+    def _result(self) -> Result:
         if sum(len(f) > 0 for f in self._frames) < 2:
             raise DatasetError("registration needs 2 or more frames with valid depth")
         measured = np.stack(self._T_world_measured)
@@ -181,10 +212,34 @@ class Registration:
         held = held_frames(problem, overlap)
         engine = self._engine(problem, np.array([not why for why in held]))
         poses = np.stack(self._T_map_camera)
-        end, known = gone_on(engine, engine.run([COARSER * finest, finest], poses, refining=True))
-        self._T_map_camera = list(end.outcome.state.T_map_camera)
         ids, stamps = tuple(self._ids), tuple(self._stamps)
-        return conclude(engine, end, known, ids, stamps, measured, held, overlap)
+        with solvable(problem, f"{len(self)} frames"):
+            end = engine.run([COARSER * finest, finest], poses, refining=True)
+            end, known = gone_on(engine, end)
+            result = conclude(
+                engine, end, known, ids, stamps, measured, held, overlap, self._stated
+            )
+        self._T_map_camera = list(end.outcome.state.T_map_camera)
+        return result
+
+    def _check(self, frame: Frame) -> None:
+        """Refuse a frame that does not go with the others."""
+        if frame.id in self._ids:
+            raise DatasetError(f"frame {frame.id} was added before")
+        if any(abs(frame.stamp - stamp) <= STAMP_TOLERANCE for stamp in self._stamps):
+            raise DatasetError(
+                f"frame {frame.id}: stamp {frame.stamp:.9f} is taken, expected one of its own"
+            )
+        if frame.sensor != self._sensor:
+            raise DatasetError(
+                f"frame {frame.id}: was taken by {_shown(frame.sensor)}, expected "
+                f"{_shown(self._sensor)} as the registration began with"
+            )
+        if not se3.is_rigid(frame.T_world_camera):
+            raise DatasetError(
+                f"frame {frame.id}: its pose is {frame.T_world_camera.tolist()}, expected a rigid "
+                "transform (4, 4)"
+            )
 
     def _begin(self, frame: Frame, cloud: NDArray[np.float32]) -> None:
         self._T_map_world = choose_map_frame(self._map_frame, [cloud], frame.T_world_camera[None])
@@ -209,6 +264,7 @@ class Registration:
             spacing=self._spacing,
             noise=self._typical if self._sensor.noise is not None else None,
             waves=waves_of(self._sensor, self._typical),
+            step=self._sensor.depth_scale or 0.0,
         )
 
     def _engine(self, problem: Problem, free: NDArray[np.bool_]) -> Engine:
@@ -254,3 +310,10 @@ class Registration:
         engine.settled = PASSING
         end = engine.run([COARSER * finest], poses, refining=True)
         return end.outcome.state.T_map_camera
+
+
+def _shown(sensor: Sensor) -> str:
+    """Name a sensor for people."""
+    lens = sensor.camera
+    kind = sensor.kind if lens is None else f"{lens.width} x {lens.height}, fx {lens.fx:g}"
+    return f"a sensor {sensor.model!r} ({kind})"

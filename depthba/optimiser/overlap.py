@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import map_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import make_grid
 from depthba.optimiser.problem import Problem
 
@@ -26,6 +27,7 @@ def overlap_matrix(
     grid = make_grid(problem, max(spacing, 4 * problem.spacing), 0.0)
     seen = np.zeros((len(problem.frames), grid.shape[0] * grid.shape[1]), np.float32)
     for i, (frame, T) in enumerate(zip(problem.frames, T_map_camera, strict=True)):
+        look()
         n = np.zeros(grid.shape)
         unused = np.zeros(grid.shape)
         map_kernels.splat(
@@ -33,6 +35,7 @@ def overlap_matrix(
         )
         seen[i] = (n > 0).ravel()
     cells = seen.sum(axis=1)
+    look()
     return np.asarray((seen @ seen.T) / np.maximum(cells, 1)[:, None], dtype=float)
 
 
@@ -47,6 +50,8 @@ def held_frames(problem: Problem, overlap: NDArray[np.float64]) -> list[str]:
         others = np.delete(np.minimum(overlap[i], 1.0), i)
         if i == 0:
             reasons.append("first frame: fixes the coordinate system")
+        elif frame.refused:
+            reasons.append(frame.refused)
         elif len(frame) < FEWEST:
             reasons.append(f"{len(frame)} points, fewer than {FEWEST}")
         elif others.max(initial=0.0) < LEAST:

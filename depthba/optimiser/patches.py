@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import patch_kernels
+from depthba.optimiser.asking import look
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import SHARES, Workers
 
@@ -301,6 +302,7 @@ def lay(
     patch: Ints = np.full(len(x), -1)
     axes, centre, size, total = [], [], [], 0
     for side in sides:
+        look()
         if not len(left):
             break
         of, V, c = _voxels(x[left], cloud.weights[left], cloud.frame[left], n, side)
@@ -356,6 +358,7 @@ def _voxels(
     key = ((cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]) * frames + frame
     order = np.argsort(key, kind="stable")
     sorted_key = key[order]
+    look()
     first = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
     view = np.cumsum(first) - 1
     where = sorted_key[first] // frames
@@ -366,6 +369,7 @@ def _voxels(
     patch_kernels.moments(order, view, x, weights, count, weight, mean, spread)
     many = count >= FEWEST
     on = voxel[many]
+    look()
     pooled = np.zeros((k, 3, 3))
     np.add.at(pooled, on, spread[many])
     total = np.bincount(on, weight[many], k)

@@ -17,6 +17,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Feet, Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
@@ -154,7 +155,13 @@ def answers(
         return found.astype(np.float32), (field - lin.C.times(found)).astype(np.float32)
 
     pairs = workers.map(answer, range(m))
-    found, left = (np.stack(p, axis=-1).reshape(-1, m) for p in zip(*pairs, strict=True))
+
+    def stacked(one: tuple[NDArray[np.float32], ...]) -> NDArray[np.float32]:
+        look()
+        return np.stack(one, axis=-1).reshape(-1, m)
+
+    found, left = (stacked(p) for p in zip(*pairs, strict=True))
+    look()
     # the solves are loose, the product is not: its error is of second order in the tolerance
     through = fields.reshape(-1, m).T @ found + left.T @ found
     own -= (through + through.T) / 2

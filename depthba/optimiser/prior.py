@@ -32,6 +32,11 @@ class PosePrior:
     gauge: NDArray[np.float64] | None = None
     """(6, 6), inverse covariance of frame 0's own error; None: it has none."""
 
+    def distances(self, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N,) by how many stated deviations each pose is off, over all six directions."""
+        e = self._errors(T_map_camera)[0]
+        return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", e, self.information, e)))
+
     def cost(self, T_map_camera: NDArray[np.float64]) -> float:
         """Return the sum of squared normalised errors, the gauge's own included."""
         e, _, _, paid = self._errors(T_map_camera)

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.dataset import Dataset, Sensor
+from depthba.camera import RangeNoise
+from depthba.dataset import Dataset, Frame, Sensor
 from depthba.errors import DatasetError, OptionError
+from depthba.optimiser.asking import look
 from depthba.optimiser.waves import Waves, waves_of
 
 Roi = tuple[float, float, float, float, float, float]
 
 # Blocks of the image (columns, rows) over which residuals are taken to be correlated.
 BLOCKS = (8, 6)
+# Points are taken to be no more than so many times noisier, or better, than the typical one.
+UNLIKE = 1e3
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,8 @@ class FramePoints:
     extent: float
     """Root mean square distance of the points from the centroid, m: the lever that compares
     rotation with shift."""
+    refused: str = ""
+    """Why its points were left out, all of them; empty where they were not."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -71,6 +79,8 @@ class Problem:
     """Standard deviation of the range at a point of weight 1, m, where the dataset states it."""
     waves: Waves | None = None
     """What a fixed pattern of the range can be made of; None: there is none."""
+    step: float = 0.0
+    """Step in which the sensor tells a depth, m; 0: it has none."""
 
     def thinned(self, stride: int) -> Problem:
         """Return the problem with every ``stride``-th point of each frame."""
@@ -80,6 +90,12 @@ class Problem:
     def ranges(self) -> float:
         """Typical distance from the sensor to the scene, m."""
         return float(np.median([np.linalg.norm(f.centroid) for f in self.frames if len(f)]))
+
+    @property
+    def rounding(self) -> float:
+        """Standard deviation of a point by its last digit alone, m: none is known better."""
+        single = float(np.finfo(np.float32).eps) * self.ranges
+        return max(single, self.step) / float(np.sqrt(12))
 
 
 def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | None) -> Problem:
@@ -93,9 +109,10 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
         raise DatasetError(
             f"{dataset.path}: {len(dataset)} frame, but registration needs at least 2"
         )
-    clouds = [frame.points() for frame in dataset]
+    clouds = [points_of(frame) for frame in dataset]
     if not any(len(p) for p in clouds):
         raise DatasetError(f"{dataset.path}: no frame has a single valid depth")
+    clouds, refused = without_repeats(clouds, dataset.ids)
     T_map_world = choose_map_frame(dataset.map_frame, clouds, T_world_camera)
     T_map_camera = T_map_world @ T_world_camera
     if roi is not None:
@@ -105,12 +122,16 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
             raise OptionError(f"--roi {' '.join(f'{v:g}' for v in roi)}: no point lies inside it")
     if sum(len(p) > 0 for p in clouds) < 2:
         seen = [f.id for f, p in zip(dataset, clouds, strict=True) if len(p)]
+        why = f" ({next(filter(None, refused))})" if any(refused) else ""
         raise DatasetError(
-            f"{dataset.path}: only frame {seen[0]} has valid depth, but registration "
+            f"{dataset.path}: only frame {seen[0]} has valid depth{why}, but registration "
             "needs 2 or more"
         )
     typical = typical_noise(dataset.sensor, clouds)
-    frames = tuple(frame_points(p, dataset.sensor, typical) for p in clouds)
+    frames = tuple(
+        replace(frame_points(p, dataset.sensor, typical), refused=why)
+        for p, why in zip(clouds, refused, strict=True)
+    )
     lower, upper = bounds(clouds, T_map_camera)
     return Problem(
         frames=frames,
@@ -122,7 +143,49 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
         spacing=point_spacing(dataset.sensor, clouds),
         noise=typical if dataset.sensor.noise is not None else None,
         waves=waves_of(dataset.sensor, typical),
+        step=dataset.sensor.depth_scale or 0.0,
     )
+
+
+def points_of(frame: Frame) -> NDArray[np.float32]:
+    """Return the points of a frame (n, 3), m, in the sensor frame.
+
+    Raises:
+        DatasetError: a file is damaged, or the camera's intrinsics send points to infinity.
+    """
+    look()
+    with np.errstate(over="ignore"):
+        points = frame.points()
+    if not np.isfinite(points).all():
+        lens = frame.sensor.camera
+        shown = f" with fx {lens.fx:g}, fy {lens.fy:g}" if lens else ""
+        raise DatasetError(
+            f"{frame.root}: frame {frame.id}: its points are not finite{shown}, expected metres"
+        )
+    return points
+
+
+def without_repeats(
+    clouds: list[NDArray[np.float32]], ids: Sequence[int]
+) -> tuple[list[NDArray[np.float32]], list[str]]:
+    """Return the clouds less those that repeat an earlier one, and why each was left out.
+
+    Noise never repeats itself: such a frame comes of a camera that hangs, or was copied, and where
+    it was measured has nothing to do with what it shows.
+    """
+    first: dict[bytes, int] = {}
+    kept, refused = [], []
+    for points, frame in zip(clouds, ids, strict=True):
+        earlier = first.setdefault(hashlib.sha256(points.tobytes()).digest(), frame)
+        again = len(points) > 0 and earlier != frame
+        refused.append(repeat_reason(earlier) if again else "")
+        kept.append(points[:0] if again else points)
+    return kept, refused
+
+
+def repeat_reason(earlier: int) -> str:
+    """Say why a frame is left out that repeats an earlier one."""
+    return f"its points are those of frame {earlier} to the last digit: left out"
 
 
 def choose_map_frame(
@@ -196,12 +259,33 @@ def typical_noise(sensor: Sensor, clouds: list[NDArray[np.float32]]) -> float:
     """Return the median standard deviation of the points' range, m; 1 where none is stated."""
     if sensor.noise is None:
         return 1.0
-    sigmas = [sensor.noise.of_points(p[:: max(1, len(p) // 2000)]) for p in clouds]
+    sigmas = [_sigmas(sensor.noise, p[:: max(1, len(p) // 2000)]) for p in clouds]
     return float(np.median(np.concatenate(sigmas)))
+
+
+def _sigmas(noise: RangeNoise, points: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the stated deviation of each point's range (n,), m, no less than its rounding.
+
+    Raises:
+        DatasetError: it is no number at some point.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        sigmas = noise.of_points(points)
+    wrong = ~np.isfinite(sigmas)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise DatasetError(
+            f"sensor.noise with sigma_m {noise.sigma_m:g}, at_m {noise.at_m:g}, power "
+            f"{noise.power:g} is {sigmas[k]:g} m at a depth of {points[k, 2]:g} m, expected a "
+            "finite standard deviation"
+        )
+    least = np.finfo(np.float32).eps * np.linalg.norm(points.astype(float), axis=1)
+    return np.asarray(np.maximum(sigmas, least))
 
 
 def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) -> FramePoints:
     """Wrap a cloud (n, 3) in the sensor frame; ``typical`` noise, m, gets the weight 1."""
+    look()
     n = len(points)
     if n == 0:
         return FramePoints(
@@ -210,7 +294,7 @@ def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) ->
     weighted = np.ones((n, 5), np.float32)
     weighted[:, :3] = points
     if sensor.noise is not None:
-        weighted[:, 3] = typical / sensor.noise.of_points(points)
+        weighted[:, 3] = np.clip(typical / _sigmas(sensor.noise, points), 1 / UNLIKE, UNLIKE)
     centroid = points.mean(axis=0, dtype=float)
     extent = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
     return FramePoints(weighted, _blocks(points, sensor), centroid, extremes(points), extent)

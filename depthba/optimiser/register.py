@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from depthba.dataset import Dataset
 from depthba.optimiser import schedule
+from depthba.optimiser.asking import listening
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.conclusion import conclude
 from depthba.optimiser.ending import gone_on
@@ -19,6 +20,7 @@ from depthba.optimiser.grid import make_grid
 from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import pose_prior
 from depthba.optimiser.problem import prepare
+from depthba.optimiser.solvable import solvable
 from depthba.optimiser.start import pose_sigmas, start_poses
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
@@ -47,6 +49,7 @@ def register(
     Raises:
         DatasetError: the dataset is damaged, or has fewer than two frames with points.
         OptionError: an option makes no sense.
+        Unsolvable: lengths are such that the equations cannot be solved.
         Cancelled: ``cancel`` said so.
     """
     options = options or Options()
@@ -57,7 +60,8 @@ def register(
     clock = Clock(options.time_limit)
     workers = Workers(options.threads or os.cpu_count() or 1, cancel)
     try:
-        return _register(dataset, options, callback or (lambda _: None), clock, workers)
+        with listening(cancel):
+            return _register(dataset, options, callback or (lambda _: None), clock, workers)
     finally:
         workers.close()
 
@@ -84,6 +88,8 @@ def _register(
     )
     clock.lap("prepare")
     engine = Engine(problem, options, prior, free, workers, clock, callback)
-    end, known = gone_on(engine, engine.run(levels, problem.T_map_camera))
+    stated = dataset.pose_noise is not None or None not in (options.prior_t, options.prior_r)
     ids, stamps = tuple(f.id for f in dataset), tuple(f.stamp for f in dataset)
-    return conclude(engine, end, known, ids, stamps, start, held, overlap)
+    with solvable(problem, str(dataset.path)):
+        end, known = gone_on(engine, engine.run(levels, problem.T_map_camera))
+        return conclude(engine, end, known, ids, stamps, start, held, overlap, stated)

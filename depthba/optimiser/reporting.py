@@ -16,24 +16,71 @@ from depthba.optimiser.problem import Problem
 from depthba.optimiser.solver import Outcome, Progress
 from depthba.result import FrameReport, Iteration, Status
 
+# Standard deviations of a measured pose, as they were stated and as they are supposed where nobody
+# stated any, beyond which pose and points contradict each other.
+FAR, FAR_SUPPOSED = 10.0, 25.0
+
+# A frame fits no more whose points agree with the map by less than this share of the usual, while
+# so many times the usual share do not (nowhere below 0.75 and above 3.1 in frames that were right).
+FITTING, STRAYS, LEAST_STRAYS = 0.72, 4.0, 0.02
+
+
+def astray(
+    ids: tuple[int, ...], distances: NDArray[np.float64], believed: bool, stated: bool
+) -> list[str]:
+    """Say which frames ended where their measured poses cannot be meant: one of the two is wrong.
+
+    An image of something else, or upside down, finds a place to fit as a rule, only not its own.
+
+    Args:
+        ids: of the frames.
+        distances: (N,) from the measured poses, in their deviations.
+        believed: whether the measured poses take part.
+        stated: whether their deviations were stated.
+    """
+    far = FAR if stated else FAR_SUPPOSED
+    return [
+        f"frame {i} lies {d:.0f} {'stated' if stated else 'usual'} deviations from its measured "
+        "pose: either its image or its pose is wrong"
+        for i, d in zip(ids, distances, strict=True)
+        if believed and d > far
+    ]
+
+
+def misfits(frames: tuple[FrameReport, ...]) -> list[str]:
+    """Say which frames do not fit the map as the others do.
+
+    That is many times the usual share of points that the robust loss lets go of, and so many that
+    fewer of the rest agree than by any occlusion.
+    """
+    usual = float(np.median([f.inliers for f in frames if f.points]))
+    return [
+        f"frame {f.frame} does not fit the map: {100 * f.inliers:.0f} % of its points agree with "
+        f"it, of a usual frame's {100 * usual:.0f} %"
+        for f in frames
+        if f.points
+        and f.inliers < FITTING * usual
+        and 1 - f.inliers > STRAYS * max(1 - usual, LEAST_STRAYS)
+    ]
+
 
 def verdict(
     outcome: Outcome, better: bool, judged: certainty.Certainty, frames: tuple[FrameReport, ...],
-    clock: Clock,
+    gone: list[str], clock: Clock,
 ) -> tuple[Status, str]:  # fmt: skip
     """Say how the registration ended, in one word and one sentence."""
     if not better:
         return "no_better", "no poses better than the start were found; the start is returned"
     starved = [f for f in frames[1:] if f.held]
     weak = sorted({w.frame for w in judged.weak})
-    if starved or weak:
+    if starved or weak or gone:
         parts = [f"frame {f.frame} was held: {f.held}" for f in starved]
         if weak:
             parts.append(
                 f"the data leave {len(judged.weak)} directions of {len(weak)} frames "
                 "to the measured poses"
             )
-        return "weak", "; ".join(parts)
+        return "weak", "; ".join(parts + gone)
     if not outcome.converged and clock.over:
         return "not_converged", f"the time limit of {clock.limit:g} s ended the iterations"
     if not outcome.converged:

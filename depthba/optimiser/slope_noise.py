@@ -88,25 +88,30 @@ def without_slope_noise(
 
 
 def _largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
-    return float(eigh(part, _firm(whole), eigvals_only=True)[-1])
+    return float(eigh(part, firm(whole), eigvals_only=True)[-1])
 
 
-def _firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
+def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix with what makes it positive definite: no direction may be held by nothing.
 
     The floor is relative to each unknown's own scale, and above what rounding leaves below zero.
     """
-    own = np.maximum(np.diag(whole), 1e-12 * np.max(np.diag(whole), initial=1e-300))
-    scaled = whole / np.sqrt(np.outer(own, own))
-    lowest = float(np.linalg.eigvalsh(scaled)[0])
-    return np.asarray(whole + max(1e-9 - lowest, 0.0) * np.diag(own))
+    # where next to nothing is known, rounding may have left less than nothing on the diagonal
+    own = np.abs(np.diag(whole))
+    own = np.maximum(own, 1e-12 * np.max(own, initial=1e-300))
+    root = np.sqrt(own)  # of each: products of tiny ones would be nothing
+    scaled = whole / np.outer(root, root)
+    values = np.linalg.eigvalsh(scaled)
+    # rows that are next to nothing beside what couples them to others make for large values
+    least = max(1e-9, 1e-12 * float(values[-1]))
+    return np.asarray(whole + max(least - float(values[0]), 0.0) * np.diag(own))
 
 
 def _less(
     S: NDArray[np.float64], noise: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return ``S - noise`` with what would fall below nothing in units of ``S + held`` set to 0."""
-    whole = _firm(S + held)
+    whole = firm(S + held)
     values, vectors = eigh(S - noise, whole)
     back = whole @ vectors
     return np.asarray((back * np.maximum(values, 0.0)) @ back.T)

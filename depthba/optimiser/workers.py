@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.errors import Cancelled
+from depthba.optimiser.asking import listen
 from depthba.optimiser.problem import Problem
 
 T = TypeVar("T")
@@ -47,7 +48,11 @@ class Workers:
         """
         self.threads = threads
         self._cancel = cancel
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._pool = (
+            ThreadPoolExecutor(threads, initializer=listen, initargs=(cancel,))
+            if threads > 1
+            else None
+        )
         self._scratch: Scratch | None = None
 
     def map(self, function: Callable[..., T], *items: Iterable[Any]) -> list[T]:
@@ -89,8 +94,11 @@ class Workers:
         ]
 
     def bands(self, rows: int) -> list[tuple[int, int]]:
-        """Deal the rows of a grid out: first row and the one past the last."""
-        count = max(1, min(self.threads, rows // LEAST_ROWS))
+        """Deal the rows of a grid out: first row and the one past the last.
+
+        As many whatever the number of threads, as with :meth:`shares`.
+        """
+        count = max(1, min(SHARES, rows // LEAST_ROWS))
         ends = [rows * k // count for k in range(count + 1)]
         return list(pairwise(ends))
 

@@ -1,0 +1,77 @@
+"""The same input gives the same answer: bits on one machine, kept numbers on any."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import depthba
+from depthba.dataset import Dataset
+from depthba.optimiser.workers import LEAST_ROWS
+from depthba.options import Options
+from depthba.result import Result
+from tests.depthba.analytic_scene import write_scene
+from tests.golden.problems import PROBLEMS, TOLERANCE, kept, solve
+
+# So fine a map that two threads share its rows; where it ends does not matter here.
+OPTIONS = {"resolution": 0.009, "max_iterations": 2}
+ELSEWHERE = """
+import json, sys
+import depthba
+from tests.depthba.test_reproducible import OPTIONS, bits
+for threads in map(int, sys.argv[2:]):
+    result = depthba.register(sys.argv[1], depthba.Options(threads=threads, **OPTIONS))
+    print(json.dumps(bits(result)))
+"""
+
+
+def bits(result: Result) -> list[str]:
+    """Return what tells two results apart, whatever the difference."""
+    arrays = (
+        result.T_world_camera,
+        result.covariance,
+        result.depth_map.heights,
+        result.depth_map.sigma,
+        np.array([i.cost for i in result.history]),
+    )
+    return [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_scene(tmp_path_factory.mktemp("repeat") / "scene", frames=3)
+
+
+def test_runs_processes_and_threads_give_the_same_bits(scene: Dataset) -> None:
+    result = depthba.register(scene, Options(threads=2, **OPTIONS))
+    assert result.depth_map.shape[0] >= 2 * LEAST_ROWS
+    here = bits(result)
+    root = Path(__file__).resolve().parents[2]
+    other = {"PYTHONHASHSEED": "7", "PYTHONPATH": str(root)}
+    there = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, str(scene.path), "1", "3"],
+        capture_output=True, text=True, env=os.environ | other, timeout=300, check=True,
+    )  # fmt: skip
+    found = [json.loads(line) for line in there.stdout.splitlines()]
+    assert found == [here] * 2
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_answers_are_those_kept_for_this_version(name: str, tmp_path: Path) -> None:
+    answers = kept()
+    assert depthba.__version__ in answers, "no answers of this version are kept: `make golden`"
+    expected = answers[depthba.__version__][name]
+    answer, result = solve(name, tmp_path)
+    assert answer["status"] == expected["status"], result.reason
+    np.testing.assert_allclose(
+        answer["moved_m_rad"], expected["moved_m_rad"], rtol=0, atol=TOLERANCE,
+        err_msg="if the optimiser was meant to change: `make golden`, and say so in CHANGELOG.md",
+    )  # fmt: skip
+    assert answer["sigma_m"] == pytest.approx(expected["sigma_m"], abs=TOLERANCE)
