@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds
 from depthba.camera import Camera, RangeNoise
 from depthba.dataset import fields
 from depthba.dataset.faults import Faults, MalformedError
@@ -165,6 +166,11 @@ def _camera(raw: fields.Record, faults: Faults) -> Camera | None:
             distortion = fields.numbers(raw["distortion"], "sensor.distortion", length=5)
     if len(size) < 2 or len(lens) < 4:
         return None
+    with faults.within(FILE):
+        try:
+            bounds.check_pixels(size["width"], size["height"])
+        except ValueError as error:
+            raise MalformedError(f"sensor.width x sensor.height is {error}") from error
     k1, k2, p1, p2, k3 = distortion
     return Camera(
         size["width"],

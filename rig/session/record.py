@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from depthba import __version__, durable
 from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
+from depthba.documents import parse_json
 from depthba.errors import DatasetError, OptionError
 from rig.cameras.camera import CameraInfo
 from rig.session.options import Session, plain
@@ -187,8 +188,14 @@ def _read_skipped(path: Path) -> list[Skipped]:
         return []
     found = {}
     for line in lines[:-1]:
-        raw = json.loads(line)
-        found[raw["station"]] = Skipped(raw["station"], raw["label"], raw["reason"])
+        try:
+            raw = parse_json(line)
+            station, label, reason = int(raw["station"]), str(raw["label"]), str(raw["reason"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{path / SKIPPED}: {line[:60]!r}, expected a pose that was skipped"
+            ) from error
+        found[station] = Skipped(station, label, reason)
     return [found[station] for station in sorted(found)]
 
 

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds
 from depthba.convert.packages import package
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
 
+_CHUNK = 1 << 18
+"""Points that are unpacked at once."""
 STEP = 1e-5
 """Of written coordinates, m; 32 bits of it reach over 40 km."""
 
@@ -20,10 +23,23 @@ def read(path: Path) -> Array:
     """Return the points (n, 3), units of the file."""
     laspy = package("laspy", "LAS")
     try:
-        cloud = laspy.read(path)
-    except (laspy.errors.LaspyException, OSError, ValueError) as error:
+        stored = path.stat().st_size
+        with laspy.open(path) as file:
+            header = file.header
+            wanted = header.point_count * header.point_format.size
+            if not header.are_points_compressed and wanted > stored:
+                raise ValueError(f"{stored} bytes for {header.point_count} points")
+            bounds.check_packed(max(wanted, 24 * header.point_count), stored)
+            points = np.empty((header.point_count, 3))
+            at = 0
+            for chunk in file.chunk_iterator(_CHUNK):
+                points[at : at + len(chunk)] = np.column_stack([chunk.x, chunk.y, chunk.z])
+                at += len(chunk)
+        if at != len(points):
+            raise ValueError(f"{at} points, expected {len(points)} as its head says")
+    except Exception as error:  # broken files fail in many ways, some of them in another language
         raise DatasetError(f"{path}: {error}, expected a LAS or LAZ file") from error
-    return np.asarray(cloud.xyz, dtype=np.float64)
+    return points
 
 
 def write(path: Path, points: Array, colours: NDArray[np.uint8] | None) -> None:
