@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/set-up
 
-.PHONY: help setup demo test lint format bench screenshots clean
+.PHONY: help setup demo test lint format bench fuzz crash licences screenshots clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,6 +33,15 @@ format: $(STAMP)  ## let ruff put the code into its form
 
 bench: $(STAMP)  ## the benchmarks
 	@$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+fuzz: $(STAMP)  ## fuzz all that parses, MINUTES=10 for each target
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(or $(MINUTES),10)
+
+crash: $(STAMP)  ## kill, fill and take away in mid-run; writes the table in docs/trust.md
+	@OPENBLAS_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python -m tests.crash
+
+licences: $(STAMP)  ## the licences of all packages, and whether they fit ours
+	@$(BIN)/python setup/licences.py
 
 screenshots: $(STAMP)  ## the pictures of the viewer in docs/; needs chromium, xvfb, mesa-vulkan-drivers
 	@$(BIN)/python docs/screenshots.py

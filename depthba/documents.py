@@ -70,7 +70,7 @@ def check_yaml(text: str) -> None:
             if isinstance(event, yaml.AliasEvent):
                 if any(anchor == event.anchor for anchor, _ in opened):
                     raise TooMuch(f"alias {event.anchor!r} lies in what it stands for")
-                nodes += sizes.get(event.anchor, 1)
+                nodes += sizes.get(str(event.anchor), 1)
             elif isinstance(event, yaml.ScalarEvent):
                 nodes += 1
                 if event.anchor is not None:

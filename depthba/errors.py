@@ -3,7 +3,6 @@
 Each is one line that names the offender, its value and what was expected.
 """
 
-
 _LONGEST = 1500
 """Characters of a line that people still read."""
 

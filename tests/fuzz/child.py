@@ -1,23 +1,23 @@
 """A process that reads hostile inputs: those that it is sent, or those that it makes itself.
 
-``python -m tests.fuzz.child TARGET`` takes inputs from stdin, each after its length, and says for
-each what was wrong. With ``--seconds S --seed K --keep FOLDER`` it makes inputs for that long and
-leaves in the folder one for each fault; with ``--atheris`` besides, guided by coverage.
+``python -m tests.fuzz.child`` takes inputs from stdin, each after the name of its target and its
+length, and says for each what was wrong. ``python -m tests.fuzz.child TARGET --seconds S --seed K
+--keep FOLDER`` makes inputs for that long and leaves in the folder one for each fault; with
+``--atheris`` besides, guided by coverage.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import re
 import shutil
-import struct
 import sys
-import tempfile
 import time
 from pathlib import Path
+
+from tests.fuzz.judging import Judge
 
 DEADLINE = 20.0
 """s; nothing that is read here takes a tenth of that on a machine that has other things to do."""
@@ -28,14 +28,13 @@ LARGEST = 1 << 20
 class Place:
     """A folder with the valid files of a target, into which inputs are put."""
 
-    def __init__(self, target_name: str) -> None:
+    def __init__(self, target_name: str, home: Path, judge: Judge) -> None:
         """Make the folder, and read the valid files, so that all that is imported is there."""
-        from tests.fuzz import judging
         from tests.fuzz.targets import target
 
         self.target = target(target_name)
-        memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
-        self._home = Path(tempfile.mkdtemp(prefix="depthba-fuzz-", dir=memory))
+        self._home = home / target_name
+        self._home.mkdir()
         self._valid = self._home / "valid" / "source"
         self.folder = self._home / "inside" / "source"
         self._valid.parent.mkdir()
@@ -47,7 +46,7 @@ class Place:
         self.target.read(self.folder)
         if self.target.writes:
             self._renew()
-        self._judge = judging.Judge(DEADLINE)
+        self._judge = judge
 
     def judge(self, data: bytes) -> str:
         """Return what was wrong with how an input was read; "" where nothing was."""
@@ -57,21 +56,26 @@ class Place:
             self._renew()
         return fault
 
-    def remove(self) -> None:
-        """Remove everything."""
-        shutil.rmtree(self._home)
-
     def _renew(self) -> None:
         shutil.rmtree(self.folder)
         shutil.copytree(self._valid, self.folder)
 
 
-def answer(place: Place) -> None:
-    """Judge what comes over stdin."""
-    print(json.dumps({"ready": place.target.name}), flush=True)
-    while head := sys.stdin.buffer.read(4):
-        data = sys.stdin.buffer.read(struct.unpack(">I", head)[0])
-        print(json.dumps({"fault": place.judge(data)}), flush=True)
+def answer(home: Path) -> None:
+    """Judge what comes over stdin: a line of JSON, target and length, then so many bytes."""
+    judge = Judge(DEADLINE)
+    places: dict[str, Place] = {}
+    while line := sys.stdin.buffer.readline():
+        asked = json.loads(line)
+        name = asked["target"]
+        if name not in places:
+            places[name] = Place(name, home, judge)
+        if "bytes" in asked:
+            fault = places[name].judge(sys.stdin.buffer.read(asked["bytes"]))
+            print(json.dumps({"fault": fault}), flush=True)
+        else:
+            seeds = [seed.hex() for seed in places[name].seeds]
+            print(json.dumps({"seeds": seeds}), flush=True)
 
 
 def make(place: Place, seconds: float, seed: int, keep: Path) -> None:
@@ -102,7 +106,7 @@ def make(place: Place, seconds: float, seed: int, keep: Path) -> None:
     print(json.dumps({"tried": tried, "faults": len(faults)}), flush=True)
 
 
-def guided(name: str, seconds: float, seed: int, keep: Path) -> None:
+def guided(name: str, home: Path, seconds: float, seed: int, keep: Path) -> None:
     """Let atheris find inputs that reach new code."""
     import atheris
 
@@ -112,7 +116,7 @@ def guided(name: str, seconds: float, seed: int, keep: Path) -> None:
                  "sim.controller", "depthba.verbs.arguments"],
         exclude=["depthba.convert.clouds.pcd"],  # numba compiles what is in it
     ):  # fmt: skip
-        place = Place(name)
+        place = Place(name, home, Judge(DEADLINE))
     corpus = keep / "corpus"
     corpus.mkdir(exist_ok=True)
     for k, data in enumerate(place.seeds):
@@ -137,23 +141,20 @@ def guided(name: str, seconds: float, seed: int, keep: Path) -> None:
 def main() -> None:
     """See the module's text."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("target")
+    parser.add_argument("target", nargs="?")
+    parser.add_argument("--home", type=Path, required=True, help="an empty folder, for its files")
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--atheris", action="store_true")
     asked = parser.parse_args()
-    if asked.atheris:
-        guided(asked.target, asked.seconds, asked.seed, asked.keep)
-        return
-    place = Place(asked.target)
-    try:
-        if asked.seconds is None:
-            answer(place)
-        else:
-            make(place, asked.seconds, asked.seed, asked.keep)
-    finally:
-        place.remove()
+    if asked.target is None:
+        answer(asked.home)
+    elif asked.atheris:
+        guided(asked.target, asked.home, asked.seconds, asked.seed, asked.keep)
+    else:
+        place = Place(asked.target, asked.home, Judge(DEADLINE))
+        make(place, asked.seconds, asked.seed, asked.keep)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,9 @@ _SCRIPT = b"""def moves():
 end
 """
 _CONTROL = b'{"do": "about"}\n{"do": "fault", "name": "slow", "on": true}\n{"do": "place", "joints": [-1.9, -1.5, 1.4, -1.4, -1.5, -0.3]}\n'
-_DASHBOARD = b"PolyscopeVersion\nget serial number\nis in remote control\nunlock protective stop\nstop\n"
+_DASHBOARD = (
+    b"PolyscopeVersion\nget serial number\nis in remote control\nunlock protective stop\nstop\n"
+)
 
 
 def _address() -> str:

@@ -60,9 +60,46 @@ NUMBERS: tuple[Any, ...] = (
     float("inf"),
     -float("inf"),
 )
-OTHERS: tuple[Any, ...] = (None, True, False, "", "a", "nan", "1e999", "٣", "\ud7ff\u2028", [], {}, [[]])
+OTHERS: tuple[Any, ...] = (
+    None,
+    True,
+    False,
+    "",
+    "a",
+    "nan",
+    "1e999",
+    "٣",
+    "\ud7ff\u2028",
+    [],
+    {},
+    [[]],
+)
 WORDS = (
-    *("nan inf -inf 1e999 -1 0 1e308 1e-320 0x10 1_0 ٣ 99999999999999999999 # , : - { [ ] } & * !").split(),
+    *[
+        "nan",
+        "inf",
+        "-inf",
+        "1e999",
+        "-1",
+        "0",
+        "1e308",
+        "1e-320",
+        "0x10",
+        "1_0",
+        "٣",
+        "99999999999999999999",
+        "#",
+        ",",
+        ":",
+        "-",
+        "{",
+        "[",
+        "]",
+        "}",
+        "&",
+        "*",
+        "!",
+    ],
     "1" * 5000,
     "\x00",
     "é",
@@ -162,7 +199,9 @@ def of_yaml(rng: random.Random, data: bytes) -> bytes:
     if what < 0.5:
         bomb = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
         bomb += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
-        key = rng.choice((b"name: *a11\n", b"poses: *a11\n", b"rig: *a11\n", b"config: *a11\n", b""))
+        key = rng.choice(
+            (b"name: *a11\n", b"poses: *a11\n", b"rig: *a11\n", b"config: *a11\n", b"")
+        )
         loop = rng.choice((b"", b"", b"hand_eye: &b [*b, *b]\n", b"limits: &c {camera: *c}\n"))
         return data + b"\n" + "\n".join(bomb).encode() + b"\n" + key + loop
     if what < 0.53:
@@ -196,7 +235,9 @@ def of_png(rng: random.Random, data: bytes) -> bytes:
         case 3:
             chunks[at] = (kind, of_bytes(rng, body))
         case 4:
-            more = rng.choice((b"iCCP", b"PLTE", b"tRNS", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fdAT"))
+            more = rng.choice(
+                (b"iCCP", b"PLTE", b"tRNS", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fdAT")
+            )
             packed = b"a\0\0" + zlib.compress(bytes(rng.choice((10, 10_000, 20_000_000))))
             chunks.insert(1, (more, rng.choice((packed, rng.randbytes(30), b""))))
         case 5:
@@ -290,7 +331,10 @@ def of_packets(rng: random.Random, data: bytes) -> bytes:
                 packets[k] = (kind, struct.pack(">d", rng.choice(doubles)) + body[8:])
             case 5:
                 names = ("actual_q", "timestamp", "input_int_register_0", "nothing", "")
-                packets[k] = (kind, body[:8] + ",".join(rng.choices(names, k=rng.choice((1, 50, 5000)))).encode())
+                packets[k] = (
+                    kind,
+                    body[:8] + ",".join(rng.choices(names, k=rng.choice((1, 50, 5000)))).encode(),
+                )
     out = b"".join(struct.pack(">H", min(len(b) + 3, 65535)) + k + b[:65532] for k, b in packets)
     return of_bytes(rng, out) if rng.random() < 0.2 else out
 
@@ -331,7 +375,13 @@ def _nasty(rng: random.Random, value: Any) -> Any:
 
 
 def _places(value: Any, above: tuple[Any, ...]) -> Any:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, inner in items:
         yield (*above, key)
         yield from _places(inner, (*above, key))

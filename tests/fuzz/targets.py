@@ -166,14 +166,13 @@ _DATASET = (
     _dataset("dataset-depth", "depth/000000.png", mutating.of_png, put=_listed),
     _dataset("dataset-rgb", "rgb/000000.png", mutating.of_png, put=_listed),
     Target("dataset-cloud", cloud_set, "cloud/000000.ply", read_dataset, mutating.of_ply, _listed),
-    Target(
-        "dataset-resume", depth_set, "frames.jsonl", _resume, mutating.of_lines, writes=True
-    ),
+    Target("dataset-resume", depth_set, "frames.jsonl", _resume, mutating.of_lines, writes=True),
     Target("mask", depth_set, "depth/000000.png", _masked, mutating.of_png),
 )
 
 
 # Runs
+
 
 def run_folder(path: Path) -> None:
     """Write a run of three frames."""
@@ -192,7 +191,9 @@ def run_folder(path: Path) -> None:
     (path / "map.npz").write_bytes(folders.map_bytes(heights))
     (path / "map_start.npz").write_bytes(folders.map_bytes(heights))
     (path / "covariance.npz").write_bytes(folders.covariance_bytes(np.eye(18)))
-    (path / "config.yaml").write_text("preset: default\nresolution: 0.02\nroi: [0, 1, 0, 1, 0, 1]\n")
+    (path / "config.yaml").write_text(
+        "preset: default\nresolution: 0.02\nroi: [0, 1, 0, 1, 0, 1]\n"
+    )
     metric = {"a": {"value": 1.0, "unit": "m", "better": "lower"}}
     (path / "metrics.json").write_text(json.dumps({"metrics": metric, "start": metric}))
     (path / "result.json").write_text(json.dumps(_RESULT))
@@ -308,12 +309,14 @@ def _gantry(path: Path) -> None:
 
 
 def _record(path: Path) -> None:
-    from rig.hand_eye.record import Open, HandEyeRecord, head, write_content
     from depthba.dataset import Dataset
+    from rig.hand_eye.record import HandEyeRecord, Open, head, write_content
 
     depth_set(path)
     opened = (Open("z", np.eye(6)[2], 0.5),)
-    record = HandEyeRecord("board", "eye-in-hand", "good", True, "well", np.eye(4), np.eye(6), opened)
+    record = HandEyeRecord(
+        "board", "eye-in-hand", "good", True, "well", np.eye(4), np.eye(6), opened
+    )
     write_content(head(record, Dataset.open(path)), path)
 
 
@@ -348,8 +351,20 @@ _SESSION = (
     Target("session-hand-eye", sessions, "hand_eye.json", read_session, mutating.of_json),
     Target("session-taught", sessions, "taught.txt", _read_taught, mutating.of_text),
     Target("hand-eye", _record, "hand_eye.json", _read_record, mutating.of_json),
-    Target("arm-calibration", sessions, "calibration.conf", _calibration("calibration.conf"), mutating.of_text),
-    Target("arm-calibration-yaml", sessions, "calibration.yaml", _calibration("calibration.yaml"), mutating.of_yaml),
+    Target(
+        "arm-calibration",
+        sessions,
+        "calibration.conf",
+        _calibration("calibration.conf"),
+        mutating.of_text,
+    ),
+    Target(
+        "arm-calibration-yaml",
+        sessions,
+        "calibration.yaml",
+        _calibration("calibration.yaml"),
+        mutating.of_yaml,
+    ),
 )
 
 

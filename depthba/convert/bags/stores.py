@@ -107,9 +107,7 @@ class _Mcap:
                 yield channel.topic, message.log_time, self._decoded(channel, message)
 
     def message(self, topic: str, time: int) -> Any:
-        found = self._reader.iter_messages(
-            topics=[topic], starting_at=time, ending_before=time + 1
-        )
+        found = self._reader.iter_messages(topics=[topic], starting_at=time, ending_before=time + 1)
         for _, channel, message in _whole(found, self._path):
             return self._decoded(channel, message)
         raise DatasetError(f"{self._path}: no message of {topic} at {time} ns")
