@@ -37,8 +37,8 @@ bench: $(STAMP)  ## the benchmarks
 fuzz: $(STAMP)  ## fuzz all that parses, MINUTES=10 for each target
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(or $(MINUTES),10)
 
-crash: $(STAMP)  ## kill, fill and take away in mid-run; writes the table in docs/trust.md
-	@OPENBLAS_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python -m tests.crash
+crash: $(STAMP)  ## kill, fill and take away in mid-run, RUNS=10 each; table in docs/trust.md
+	@OPENBLAS_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python -m tests.crash --runs $(or $(RUNS),10)
 
 licences: $(STAMP)  ## the licences of all packages, and whether they fit ours
 	@$(BIN)/python setup/licences.py

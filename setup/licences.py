@@ -27,6 +27,7 @@ BINDS = re.compile(r"(?<!L)GPL|Affero|SSPL|Commercial|Proprietary|NonCommercial|
 """What would bind us, or whom we give it to."""
 
 SEEN = {
+    "atheris": "Apache-2.0, after its repository; dev alone; its metadata say nothing",
     "evo": "GPL-3.0; dev alone: an outside check in tests, imported by nothing that is shipped",
     "genicam": "the GenICam licence, which lets binaries be passed on; cameras alone, optional",
     "apsw": "any that OSI has approved, so zlib; used by rosbags",
