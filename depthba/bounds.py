@@ -8,6 +8,7 @@ than twice the bytes of its file and `SPARE`, but for points that are packed, wh
 from __future__ import annotations
 
 import io
+import warnings
 from typing import Any
 
 import numpy as np
@@ -44,8 +45,10 @@ def check_image(data: bytes) -> None:
             tags.load(file)
             width, height = int(tags[256]), int(tags[257])
         else:
-            with Image.open(io.BytesIO(data)) as image:
+            with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
                 width, height = image.size
+    except Image.DecompressionBombError:
+        raise ValueError(f"far more pixels than the {PIXELS} that are expected at most") from None
     except Exception as error:  # a broken head fails in many ways
         raise ValueError("a head that cannot be read") from error
     check_pixels(width, height)

@@ -34,7 +34,7 @@ SEEN = {
     "embreex": "MIT, after its repository; its metadata hold a line of the text alone",
     "cycler": "BSD-3-Clause, after the text in its metadata",
 }
-"""Packages whose metadata do not settle it, or whose licence does not fit, and why they may stay."""
+"""Packages whose metadata do not settle it, or whose licence does not fit; why they may stay."""
 
 
 def name_of(text: str) -> str:

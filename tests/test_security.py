@@ -1,4 +1,4 @@
-"""What docs/security.md promises: nothing that is read can run, and nothing listens to the world."""
+"""What docs/security.md promises: nothing that is read is run, nothing listens to the world."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from depthba import bounds
 from depthba.camera import Camera, RangeNoise
 from depthba.dataset import fields
 from depthba.dataset.faults import Faults, MalformedError
+from depthba.dataset.listing import inside
 from depthba.dataset.sensor import PoseNoise, Sensor
 from depthba.errors import DatasetError
 from depthba.trajectory import read_text
@@ -21,6 +22,8 @@ from depthba.trajectory import read_text
 FORMAT = "depthba-dataset"
 VERSION = 1
 FILE = "dataset.json"
+_READ = (FILE, "frames.jsonl", "markers.json", "calibration.json")
+"""Beside the poses, what is read without being listed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,12 @@ def _header_text(root: Path) -> str:
         raise DatasetError(f"{root}: {error.strerror}, expected a readable folder") from error
     if FILE not in entries:
         raise DatasetError(f"{root}: no {FILE} in it, expected a dataset")
+    for name in sorted(entries):
+        if name in _READ or name.startswith("poses_"):
+            try:
+                inside(root, name)
+            except MalformedError as error:
+                raise DatasetError(f"{root}: {error}") from error
     return read_text(root / FILE)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -44,6 +45,8 @@ def main() -> int:
     parser.add_argument("--faults", nargs="*", help="all, where none is named")
     parser.add_argument("--no-page", action="store_true", help="leave docs/trust.md as it is")
     asked = parser.parse_args()
+    # disks are taken down again, and runs ended, also where somebody ends this
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     rows: list[tuple[str, str, Tally]] = []
     with tempfile.TemporaryDirectory(prefix="depthba-crash-") as name:
         home = Path(name)

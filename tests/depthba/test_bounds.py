@@ -17,7 +17,7 @@ from depthba.errors import DatasetError, DepthbaError
 
 def test_a_sensor_of_too_many_pixels_is_refused(small: Any) -> None:
     small.change(sensor__width=100_000, sensor__height=100_000)
-    with pytest.raises(DatasetError, match="sensor.height is 100000 x 100000 pixels, expected 160"):
+    with pytest.raises(DatasetError, match="100000 x 100000 pixels, expected 160"):
         Dataset.open(small.path)
 
 
@@ -33,7 +33,9 @@ def test_heads_of_images_are_understood(suffix: str) -> None:
 
 
 def test_an_image_of_too_many_pixels_is_refused_by_its_head() -> None:
-    with pytest.raises(ValueError, match="40000 x 30000 pixels"):
+    with pytest.raises(ValueError, match="10000 x 9000 pixels, expected 16000000 at most"):
+        bounds.check_image(b"P5\n10000 9000\n255\n" + bytes(100))
+    with pytest.raises(ValueError, match="far more pixels"):
         bounds.check_image(b"P5\n40000 30000\n255\n" + bytes(100))
 
 

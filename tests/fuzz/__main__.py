@@ -58,8 +58,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="for each target")
     parser.add_argument("--seed", type=int, help="None: by the clock")
     parser.add_argument("--keep", type=Path, default=ROOT / "logs" / "fuzz")
-    parser.add_argument("--driver", choices=("both", "own", "atheris"), default="both",
-                        help="own: mutations of structure; atheris: guided by coverage")  # fmt: skip
+    told = "own: mutations of structure; atheris: guided by coverage"
+    parser.add_argument("--driver", choices=("both", "own", "atheris"), default="both", help=told)
     asked = parser.parse_args()
     seed = int(time.time()) if asked.seed is None else asked.seed
     guided = importlib.util.find_spec("atheris") is not None

@@ -5,6 +5,7 @@ An input is what a client sends. The controller must hang up or answer, and go o
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import struct
@@ -44,7 +45,10 @@ _SCRIPT = b"""def moves():
   movel(p[0.3, 0.3, 0.3, 0.0, 3.1, 0.0], a=0.5, v=0.2)
 end
 """
-_CONTROL = b'{"do": "about"}\n{"do": "fault", "name": "slow", "on": true}\n{"do": "place", "joints": [-1.9, -1.5, 1.4, -1.4, -1.5, -0.3]}\n'
+_CONTROL = b"""{"do": "about"}
+{"do": "fault", "name": "slow", "on": true}
+{"do": "place", "joints": [-1.9, -1.5, 1.4, -1.4, -1.5, -0.3]}
+"""
 _DASHBOARD = (
     b"PolyscopeVersion\nget serial number\nis in remote control\nunlock protective stop\nstop\n"
 )
@@ -81,10 +85,8 @@ def _send(port: int, path: Path) -> None:
         data = (path / FILE).read_bytes()
         with socket.create_connection((host, port), 5.0) as client:
             client.settimeout(0.2)
-            try:
+            with contextlib.suppress(OSError):  # it may hang up
                 client.sendall(data)
-            except OSError:  # it has hung up, as it may
-                pass
             time.sleep(PASSES)
             with socket.create_connection((host, CONTROL_PORT), 5.0) as other:
                 other.settimeout(2.0)

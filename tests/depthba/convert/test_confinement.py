@@ -51,7 +51,7 @@ def test_a_link_that_leads_out_is_refused(depth_set: Dataset, tmp_path: Path, fo
     inner = scan / "depth" if folder else scan / "pose" / "1.txt"
     inner.rename(tmp_path / "elsewhere")
     inner.symlink_to(tmp_path / "elsewhere", target_is_directory=folder)
-    with pytest.raises(DatasetError, match="a link out of .*, expected .*--outside"):
+    with pytest.raises(DatasetError, match=r"a link out of .*, expected .*--outside"):
         importing.read(scan, Reading())
     assert len(importing.read(scan, Reading(outside=True)).frames) == len(depth_set)
 
