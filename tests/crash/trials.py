@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -173,7 +173,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
         _, said = process.communicate(timeout=LONGEST)
     finally:
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+            _kill(process)
             process.wait()
     lines = said.strip().splitlines()
     return process.returncode, lines[-1] if lines else ""
@@ -212,6 +212,12 @@ def small_disk(path: Path, size: str) -> Iterator[Path]:
         subprocess.run(["umount", str(path)], check=True)
 
 
+def _kill(process: subprocess.Popen[str]) -> None:
+    """End a process and all that it has started; it may have ended by itself."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
 # What happens
 
 
@@ -220,7 +226,7 @@ def killed(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
     process = start(verb.words(out))
     wait_for(process, out, rng.randrange(files + 1))
     time.sleep(rng.uniform(0.0, 0.05))
-    os.killpg(process.pid, signal.SIGKILL)
+    _kill(process)
     ended(process)
 
 
@@ -260,7 +266,7 @@ def jumped(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
     """The wall clock jumps back and forth, and the run is killed besides."""
     process = start(verb.words(out), clock=rng.randrange(1000))
     wait_for(process, out, rng.randrange(files + 1))
-    os.killpg(process.pid, signal.SIGKILL)
+    _kill(process)
     ended(process)
     again = () if not out.exists() or not any(out.iterdir()) else verb.again
     status, said = ended(start([*verb.words(out), *again], clock=rng.randrange(1000)))
