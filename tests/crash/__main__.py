@@ -71,11 +71,11 @@ def main() -> int:
                 print(f"{verb.name}, {fault}: {told}", flush=True)
                 for line in row.broken:
                     print(f"  {line}", flush=True)
+                if not asked.no_page:
+                    before, _, rest = PAGE.read_text().partition(BEGIN)
+                    after = rest.partition(END)[2]
+                    PAGE.write_text(f"{before}{BEGIN}\n{table(rows)}\n{END}{after}")
     print(table(rows))
-    if not asked.no_page:
-        before, _, rest = PAGE.read_text().partition(BEGIN)
-        after = rest.partition(END)[2]
-        PAGE.write_text(f"{before}{BEGIN}\n{table(rows)}\n{END}{after}")
     return 1 if any(t.lost or t.broken for _, _, t in rows) else 0
 
 

@@ -118,7 +118,7 @@ def verbs(dataset: Path) -> tuple[Verb, ...]:
     """Return what is disturbed; ``dataset`` is a small one."""
     scene = ["industrial-6", "--frames", "6", "--size", "64x48", "--seed", "3"]
     solve = ["--resolution", "0.1", "--max-iterations", "3"]
-    methods = ["--methods", "initial,gicp-pgo,paper", "--workers", "1"]
+    methods = ["--methods", "initial,gicp-pgo,depthba-paper", "--workers", "1"]
     return (
         Verb("generate", lambda out: ["generate", *scene, "--out", str(out)], _frames),
         Verb("capture", _capture, _frames),
