@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from depthba import __version__, durable
 from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
+from depthba.dataset.faults import Faults
+from depthba.dataset.header import read_header
 from depthba.documents import parse_json
 from depthba.errors import DatasetError, OptionError
 from rig.cameras.camera import CameraInfo
@@ -122,8 +124,10 @@ def stored_plan(path: Path, session: Session, space: Workspace, rehearsed: bool)
         DatasetError: the dataset was made by something else, or is no dataset.
         OptionError: the session has changed since; lists all that differs.
     """
-    header = Dataset.open(path).header
-    source = header.get("source")
+    # the header alone: a frame whose file was taken away since is for resuming to make good
+    found = read_header(path, Faults(path))
+    assert found is not None  # strict faults raise
+    source = found.raw.get("source")
     if not isinstance(source, Mapping) or source.get("tool") != TOOL or "plan" not in source:
         raise DatasetError(
             f"{path}: a dataset that no capture session began, expected none or one of this session"
