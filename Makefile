@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/set-up
 
-.PHONY: help setup demo docs test lint format bench golden screenshots clean
+.PHONY: help setup demo docs test lint format bench golden fuzz crash licences screenshots clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -40,6 +40,15 @@ bench: $(STAMP)  ## the benchmarks
 
 golden: $(STAMP)  ## solve the small problems anew whose answers are kept for every version
 	@$(BIN)/python -m tests.golden.problems
+
+fuzz: $(STAMP)  ## fuzz all that parses, MINUTES=10 for each target
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(or $(MINUTES),10)
+
+crash: $(STAMP)  ## kill, fill and take away in mid-run, RUNS=10 each; table in docs/trust.md
+	@OPENBLAS_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python -m tests.crash --runs $(or $(RUNS),10)
+
+licences: $(STAMP)  ## the licences of all packages, and whether they fit ours
+	@$(BIN)/python setup/licences.py
 
 screenshots: $(STAMP)  ## the pictures in docs/; needs chromium, xvfb, mesa-vulkan-drivers
 	@$(BIN)/python docs/plot_pictures.py

@@ -3,9 +3,19 @@
 Each is one line that names the offender, its value and what was expected.
 """
 
+_LONGEST = 1500
+"""Characters of a line that people still read."""
+
 
 class DepthbaError(Exception):
     """A known error. The command line prints its one line on stderr and exits with status 1."""
+
+    def __str__(self) -> str:
+        """Return the line; one that quotes far too much loses its middle."""
+        line = super().__str__()
+        if len(line) <= _LONGEST:
+            return line
+        return f"{line[: _LONGEST - 400]} … {line[-400:]}"
 
 
 class DatasetError(DepthbaError):

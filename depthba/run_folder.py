@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 import os
 import platform
 import time
 import zipfile
+import zlib
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -21,10 +21,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from depthba import durable, trajectory
+from depthba import bounds, durable, trajectory
 from depthba.clouds import FrameCloud, inside, load_clouds, thin, transform
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
+from depthba.documents import parse_json, parse_yaml
 from depthba.errors import DatasetError, RunError
 from depthba.options import Options
 from depthba.ply import write_ply
@@ -268,7 +269,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-BROKEN = (OSError, KeyError, ValueError, zipfile.BadZipFile, yaml.YAMLError, DatasetError)
+BROKEN = (OSError, KeyError, TypeError, ValueError, yaml.YAMLError, DatasetError)
 """What reading the files of a broken run raises."""
 
 
@@ -309,7 +310,9 @@ class Run:
             raise RunError(f"{path}: no such run folder, expected one that register wrote")
         result = read_result(path)
         try:
-            config = yaml.safe_load((path / "config.yaml").read_text())
+            config = parse_yaml((path / "config.yaml").read_text(encoding="utf-8"))
+            if not isinstance(config, dict):
+                raise ValueError(f"config.yaml holds {type(config).__name__}, expected options")
             stamps, T_world_camera = trajectory.read_tum(path / "poses.txt")[:2]
             start = path / "poses_start.txt"
             T_start = trajectory.read_tum(start)[1] if start.exists() else None
@@ -317,8 +320,11 @@ class Run:
             map_start = path / "map_start.npz"
             covariance = None
             if (path / "covariance.npz").exists():
-                with np.load(path / "covariance.npz") as arrays:
-                    covariance = arrays["full"]
+                covariance = read_arrays(path / "covariance.npz")["full"]
+                if covariance.shape != (6 * len(stamps),) * 2:
+                    raise ValueError(
+                        f"covariance.npz: full of shape {covariance.shape} for {len(stamps)} poses"
+                    )
             return cls(
                 path=path,
                 name=str(result["name"]),
@@ -333,7 +339,8 @@ class Run:
                 dataset_path=Path(result["dataset"]["path"]),
             )
         except BROKEN as error:
-            raise RunError(f"{path}: not a whole run folder: {error}") from error
+            told = f"{type(error).__name__} {error}" if isinstance(error, KeyError) else error
+            raise RunError(f"{path}: not a whole run folder: {told}") from error
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -345,7 +352,7 @@ def read_result(path: Path) -> dict[str, Any]:
     """
     file = path / "result.json"
     try:
-        result = json.loads(file.read_text())
+        result = parse_json(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RunError(f"{file}: missing, expected a folder that register finished") from None
     except (OSError, ValueError) as error:
@@ -358,14 +365,45 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def read_map(path: Path) -> DepthMap:
-    """Read a map.npz."""
-    with np.load(path) as arrays:
-        x, y = arrays["origin"]
-        return DepthMap(
-            heights=arrays["heights"],
-            origin=(float(x), float(y)),
-            spacing=float(arrays["spacing"]),
-            T_map_world=arrays["T_map_world"],
-            count=arrays["count"],
-            sigma=arrays["sigma"],
-        )
+    """Read a map.npz. Raises one of `BROKEN`."""
+    arrays = read_arrays(path)
+    shape = arrays["heights"].shape
+    expected = {"heights": shape, "count": shape, "sigma": shape, "T_map_world": (4, 4)}
+    expected |= {"origin": (2,), "spacing": ()}
+    for name, wanted in expected.items():
+        array = arrays[name]
+        if array.shape != wanted or array.dtype.kind not in "fiu" or len(shape) != 2:
+            raise ValueError(f"{path.name}: {name} of shape {array.shape}, {array.dtype}")
+    x, y = arrays["origin"]
+    return DepthMap(
+        heights=arrays["heights"],
+        origin=(float(x), float(y)),
+        spacing=float(arrays["spacing"]),
+        T_map_world=arrays["T_map_world"],
+        count=arrays["count"],
+        sigma=arrays["sigma"],
+    )
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an npz file, which must not be larger than it could be worth.
+
+    Raises:
+        ValueError: it is none, or its arrays are larger than `depthba.bounds` allows.
+
+    """
+    data = path.read_bytes()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            total = sum(entry.file_size for entry in entries)
+            if total > bounds.SPARE // 2 + 2 * len(data):
+                raise ValueError(f"{total} bytes packed into {len(data)}")
+            return {
+                entry.filename.removesuffix(".npy"): bounds.read_array(archive.read(entry))
+                for entry in entries
+            }
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path.name}: {error}, expected an archive of arrays") from error
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from depthba.documents import parse_yaml
 from depthba.errors import OptionError
 from depthba.kinematics import UR16E, DhArm
 
@@ -40,7 +41,7 @@ def _of_conf(text: str, path: Path) -> dict[str, object]:
     try:
         parser.read_string(text)
         return {
-            name: yaml.safe_load(value)
+            name: parse_yaml(value)
             for section in parser.sections()
             for name, value in parser.items(section)
             if name in NAMES
@@ -51,7 +52,7 @@ def _of_conf(text: str, path: Path) -> dict[str, object]:
 
 def _of_yaml(text: str, path: Path) -> dict[str, object]:
     try:
-        entries = yaml.safe_load(text)
+        entries = parse_yaml(text)
     except yaml.YAMLError as error:
         raise OptionError(f"calibration {path}: {' '.join(str(error).split())}") from None
     if not isinstance(entries, dict):

@@ -6,7 +6,6 @@ of every iteration, the figures. The poses and maps between are gone.
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,6 +13,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from depthba.dataset import Dataset
+from depthba.documents import parse_json
 from depthba.errors import RunError
 from depthba.options import Options, options_of
 from depthba.result import FrameReport, Result, WeakDirection
@@ -89,7 +89,7 @@ def archived_result(run: Run, dataset: Dataset) -> Result:
             seconds=told["seconds"],
             overlap=np.array(told["overlap"], dtype=float),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{run.path}: result.json is not whole: {error}") from error
 
 
@@ -109,7 +109,7 @@ def archived_metrics(run: Path) -> list[Metric]:
     if not file.is_file():
         return []
     try:
-        told = json.loads(file.read_text())
+        told = parse_json(file.read_text(encoding="utf-8"))
 
         def read(metrics: dict[str, Any]) -> list[Metric]:
             return [
@@ -118,7 +118,7 @@ def archived_metrics(run: Path) -> list[Metric]:
             ]
 
         return [*read(told["metrics"]), *start(read(told["start"]))]
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{file}: not readable: {error!r}") from error
 
 

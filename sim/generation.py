@@ -114,7 +114,13 @@ def is_complete(scene: str, out: str | Path, options: GenerateOptions) -> bool:
         listed = (out / "frames.jsonl").read_bytes().count(b"\n")
     except (OSError, ValueError, LookupError, TypeError):
         return False
-    return bool(source == _source(scene, options)) and listed == frames
+    if source != _source(scene, options) or listed != frames:
+        return False
+    try:
+        Dataset.open(out)
+    except DatasetError:  # a file was taken away since
+        return False
+    return True
 
 
 def draw_stages(scene: str, path: str | Path, options: GenerateOptions, frame: int = 0) -> Path:

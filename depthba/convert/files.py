@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds, documents
 from depthba.dataset.faults import MalformedError
 from depthba.dataset.images import png_chunks
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
+
+OUTSIDE = "a file in it, or --outside where you know what it leads to"
 
 DEPTH_SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".npy")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
@@ -30,6 +33,40 @@ def in_order(files: Iterable[Path]) -> list[Path]:
         return [(1, int(w), "") if w.isdecimal() else (0, 0, w) for w in words]
 
     return sorted(files, key=key)
+
+
+def named(root: Path, name: str, where: Path, outside: bool) -> Path:
+    """Return the file that a source names, below its folder.
+
+    Args:
+        root: the folder.
+        name: as the source has it.
+        where: the file of the source that has it.
+        outside: whether it may lie outside of the folder.
+
+    Raises:
+        DatasetError: it does, and may not.
+
+    """
+    told = name if len(name) <= 80 else name[:77] + "…"
+    try:
+        path = root / name
+        inside = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # too long, a loop of links, a NUL in it
+        raise DatasetError(f"{where}: {told!r} is no name of a file") from error
+    if not inside and not outside:
+        raise DatasetError(f"{where}: {told!r} leads out of {root}, expected {OUTSIDE}")
+    return path
+
+
+def refuse_links_out(root: Path) -> None:
+    """Refuse a source with a link in it that leads out of it. `DatasetError` names the link."""
+    home = root.resolve()
+    for folder, folders, names in os.walk(home):
+        for name in (*folders, *names):
+            path = Path(folder, name)
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise DatasetError(f"{path}: a link out of {root}, expected {OUTSIDE}")
 
 
 def listed(folder: Path, suffixes: Sequence[str], pattern: str = "*") -> list[Path]:
@@ -54,7 +91,7 @@ def text(path: Path) -> str:
 def json_object(path: Path) -> dict[str, Any]:
     """Return the JSON object in a file."""
     try:
-        value = json.loads(text(path))
+        value = documents.parse_json(text(path))
     except ValueError as error:
         raise DatasetError(f"{path}: not JSON: {error}") from error
     if not isinstance(value, dict):
@@ -80,7 +117,7 @@ def numbers(path: Path, *columns: int, row_limit: int | None = None) -> Array:
             )
         if len(rows) == row_limit:
             break
-    return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else columns[0])
 
 
 def matrix(path: Path, rows: int = 4) -> Array:
@@ -126,8 +163,11 @@ def _load_depth(path: Path, scale: float, invalid: tuple[int, ...], floats: bool
     if pixels.dtype not in (np.uint16, np.uint32) and not (floats and pixels.dtype.kind == "f"):
         kinds = "16-bit" + (" or floating-point" if floats else "")
         raise DatasetError(f"{path}: pixels of type {pixels.dtype}, expected {kinds} depth")
-    z = pixels * np.float64(scale)
-    gone = ~np.isfinite(z) | (pixels <= 0)
+    gone = pixels <= 0
+    if pixels.dtype.kind == "f":
+        gone |= ~np.isfinite(pixels)
+    z = pixels.astype(np.float64)
+    z *= scale
     for value in invalid:
         gone |= pixels == value
     z[gone] = np.nan
@@ -137,9 +177,7 @@ def _load_depth(path: Path, scale: float, invalid: tuple[int, ...], floats: bool
 def _load_colour(path: Path) -> NDArray[np.uint8]:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DatasetError(f"{path}: cannot be decoded, expected a colour image")
+    image = _decoded(path, cv2.IMREAD_COLOR, "a colour image")
     return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
 
 
@@ -148,13 +186,29 @@ def _pixels(path: Path) -> NDArray[Any]:
 
     if path.suffix.lower() == ".npy":
         try:
-            array = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+            array = bounds.read_array(_bytes(path))
+            array = array.squeeze(-1) if array.ndim == 3 and array.shape[2] == 1 else array
+            if array.ndim != 2:
+                raise ValueError(f"shape {array.shape}")
+            bounds.check_pixels(*array.shape)
+        except ValueError as error:
             raise DatasetError(f"{path}: {error}, expected an array of depth") from error
-        return np.asarray(array.squeeze(-1) if array.ndim == 3 and array.shape[2] == 1 else array)
-    image = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+        return array
+    return _decoded(path, cv2.IMREAD_UNCHANGED, "a depth image")
+
+
+def _decoded(path: Path, how: int, what: str) -> NDArray[Any]:
+    """Return the pixels of an image whose head was looked at before."""
+    import cv2
+
+    data = _bytes(path)
+    try:
+        bounds.check_image(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+    except (ValueError, cv2.error) as error:
+        raise DatasetError(f"{path}: {error}, expected {what}") from error
     if image is None:
-        raise DatasetError(f"{path}: cannot be decoded, expected a depth image")
+        raise DatasetError(f"{path}: cannot be decoded, expected {what}")
     return np.asarray(image)
 
 
@@ -163,6 +217,8 @@ def _bytes(path: Path) -> bytes:
         data = path.read_bytes()
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file, expected an image") from None
+    except ValueError as error:  # a NUL in its name
+        raise DatasetError(f"{str(path)!r}: {error}, expected an image") from error
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror}, expected a readable image") from error
     if not data:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from depthba import __version__
 from depthba.camera import Camera
-from depthba.convert import overlap, registry
+from depthba.convert import files, overlap, registry
 from depthba.convert.reading import Reading
 from depthba.convert.recording import Recording, SourceFrame
 from depthba.dataset import Dataset, DatasetWriter
@@ -55,7 +55,12 @@ def read(path: Path, reading: Reading) -> Recording:
         raise OptionError(f"--kind {found.name}: is written only, not read")
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
-    recording = found.read(path, reading).ready(reading)
+    if path.is_dir() and not reading.outside:
+        files.refuse_links_out(path)
+    try:
+        recording = found.read(path, reading).ready(reading)
+    except OSError as error:
+        raise DatasetError(f"{path}: {error}, expected files that can be read") from error
     if reading.unchecked:
         return replace(recording, notes=(*recording.notes, "conventions not checked"))
     return replace(recording, notes=(*recording.notes, *overlap.check(recording)[1]))

@@ -78,7 +78,7 @@ def read_open3d(path: Path) -> Camera:
         distortion = tuple(float(v) for v in value.get("distortion", (0.0,) * 5))
         size = int(value["width"]), int(value["height"])
         return made(*size, (fx, fy, cx, cy), distortion, str(path))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DatasetError(
             f"{path}: {error!r}, expected width, height and intrinsic_matrix of 9 numbers, "
             "column by column, as Open3D writes them"

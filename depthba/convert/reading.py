@@ -40,5 +40,7 @@ class Reading:
     """Topic of the depth images in a bag. None: the only one there is."""
     fixed_frame: str | None = None
     """Frame of a bag's tf tree that is the world. None: the root above the camera."""
+    outside: bool = False
+    """Follow names and links in the source that lead out of it."""
     unchecked: bool = False
     """Take the conventions as they are, whether the frames overlap under them or not."""

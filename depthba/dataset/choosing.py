@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds
 from depthba.dataset.cutting import Bounds, Cut, Roi
 from depthba.dataset.listing import STAMP_TOLERANCE
 from depthba.dataset.model import Frame
@@ -168,7 +169,12 @@ def _mask_file(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
     if not path.is_file():
         raise DatasetError(f"{path}: no such file, expected an image to mask with")
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    data = path.read_bytes()
+    try:
+        bounds.check_image(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (ValueError, cv2.error) as error:
+        raise DatasetError(f"{path}: {error}, expected an image to mask with") from error
     if image is None:
         raise DatasetError(f"{path}: not an image, expected one to mask with")
     if image.shape != shape:

@@ -10,9 +10,11 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds
 from depthba.camera import Camera, RangeNoise
 from depthba.dataset import fields
 from depthba.dataset.faults import Faults, MalformedError
+from depthba.dataset.listing import inside
 from depthba.dataset.sensor import PoseNoise, Sensor
 from depthba.errors import DatasetError
 from depthba.trajectory import read_text
@@ -20,6 +22,8 @@ from depthba.trajectory import read_text
 FORMAT = "depthba-dataset"
 VERSION = 1
 FILE = "dataset.json"
+_READ = (FILE, "frames.jsonl", "markers.json", "calibration.json")
+"""Beside the poses, what is read without being listed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +102,12 @@ def _header_text(root: Path) -> str:
         raise DatasetError(f"{root}: {error.strerror}, expected a readable folder") from error
     if FILE not in entries:
         raise DatasetError(f"{root}: no {FILE} in it, expected a dataset")
+    for name in sorted(entries):
+        if name in _READ or name.startswith("poses_"):
+            try:
+                inside(root, name)
+            except MalformedError as error:
+                raise DatasetError(f"{root}: {error}") from error
     return read_text(root / FILE)
 
 
@@ -165,6 +175,11 @@ def _camera(raw: fields.Record, faults: Faults) -> Camera | None:
             distortion = fields.numbers(raw["distortion"], "sensor.distortion", length=5)
     if len(size) < 2 or len(lens) < 4:
         return None
+    with faults.within(FILE):
+        try:
+            bounds.check_pixels(size["width"], size["height"])
+        except ValueError as error:
+            raise MalformedError(f"sensor.width x sensor.height is {error}") from error
     k1, k2, p1, p2, k3 = distortion
     return Camera(
         size["width"],

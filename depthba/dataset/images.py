@@ -15,6 +15,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
 _COMPRESSION = 3
 """Fixed, so that equal images give equal bytes; higher levels save little on noisy depth."""
+_ROWS = 256
 _ROUNDING = 1e-6
 """Share of a depth step by which depth_min and depth_max give: decimals are not exact in binary."""
 
@@ -26,13 +27,18 @@ def decode_depth(png: bytes, sensor: Sensor) -> NDArray[np.float32]:
     """
     pixels = _decode(png, sensor, bits=16, channels="grey")
     scale = sensor.depth_scale or 1.0
-    z = pixels * np.float64(scale)
-    seen = pixels > 0
-    if sensor.depth_min is not None:
-        seen &= z >= sensor.depth_min - _ROUNDING * scale
-    if sensor.depth_max is not None:
-        seen &= z <= sensor.depth_max + _ROUNDING * scale
-    return np.where(seen, z, np.nan).astype(np.float32)
+    depth = np.empty(pixels.shape, np.float32)
+    for rows in range(0, len(pixels), _ROWS):  # in double precision, but not all of it at once
+        part = pixels[rows : rows + _ROWS]
+        z = part * np.float64(scale)
+        seen = part > 0
+        if sensor.depth_min is not None:
+            seen &= z >= sensor.depth_min - _ROUNDING * scale
+        if sensor.depth_max is not None:
+            seen &= z <= sensor.depth_max + _ROUNDING * scale
+        with np.errstate(over="ignore"):  # more than single precision holds is infinite
+            depth[rows : rows + _ROWS] = np.where(seen, z, np.nan)
+    return depth
 
 
 def decode_rgb(png: bytes, sensor: Sensor) -> NDArray[np.uint8]:

@@ -165,9 +165,11 @@ def _read(path: str, kind: type[Any]) -> dict[str, Any]:
     """Return the values in the file, parsed as the command line would parse them."""
     import yaml
 
+    from depthba.documents import parse_yaml
+
     with open(path, encoding="utf-8") as file:
         try:
-            content = yaml.safe_load(file)
+            content = parse_yaml(file.read())
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise OptionError(f"{path}: not YAML: {error}") from error
     if content is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from depthba import durable
+from depthba.documents import parse_json
 from eval.metrics import Metric
 
 FILE = "outcome.json"
@@ -119,8 +119,8 @@ class Outcome:
 def read(folder: Path) -> Outcome | None:
     """Return the outcome that a folder holds; None where there is none that can be read."""
     try:
-        return Outcome.of_json(json.loads((folder / FILE).read_text(encoding="utf-8")))
-    except (OSError, KeyError, TypeError, ValueError, AttributeError):
+        return Outcome.of_json(parse_json((folder / FILE).read_text(encoding="utf-8")))
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, OverflowError):
         return None
 
 

@@ -64,6 +64,8 @@ def needed(job: Job, method: str) -> bool:
     there = outcome.read(job.folder(method))
     if there is None or there.key != job.key(method):
         return True
+    if there.status == "done" and not (job.folder(method) / outcome.POSES).is_file():
+        return True
     if there.status in ("time", "memory"):
         limit = "seconds" if there.status == "time" else "bytes"
         return there.limits.get(limit, 0.0) < _limits(job)[limit]

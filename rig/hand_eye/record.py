@@ -5,7 +5,6 @@ Lengths in m and rotations in rad but for what is named otherwise.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from depthba import durable, se3
 from depthba.dataset import Dataset
+from depthba.documents import parse_json
 from depthba.errors import OptionError
 
 Array = NDArray[np.float64]
@@ -172,7 +172,7 @@ def read_transform(path: Path) -> NDArray[np.float64]:
 
 def _read(path: Path, option: str) -> Any:  # JSON is untyped until it is checked
     try:
-        return json.loads(path.read_text())
+        return parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, UnicodeDecodeError) as error:
         raise OptionError(
             f"{option} {path}: no T_flange_camera in it, expected JSON: {error}"

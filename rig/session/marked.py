@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
+from depthba.documents import check_yaml
 from depthba.errors import DepthbaError, OptionError
 
 OPTIONS_OF = "options_of"
@@ -31,7 +32,9 @@ def read_marked(path: Path, kind: Any) -> Any:
         OSError: the file cannot be read.
     """
     try:
-        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        text = path.read_text(encoding="utf-8")
+        check_yaml(text)
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
     except UnicodeDecodeError:
         raise OptionError(f"{path}: is no text, expected YAML") from None
     except yaml.MarkedYAMLError as error:
@@ -165,7 +168,8 @@ def _plain(node: yaml.Node) -> Any:
     loader = yaml.SafeLoader("")
     try:
         return loader.construct_document(node)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, KeyError) as error:
+        # beside what is no YAML: dates that do not exist, merges of what cannot be merged
         raise _Misfit from error
     finally:
         loader.dispose()
@@ -196,7 +200,7 @@ def _number(value: Any) -> float:
         raise _Misfit
     try:
         number = float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise _Misfit from None
     if not math.isfinite(number):
         raise _Misfit
@@ -208,6 +212,8 @@ def _shown(node: yaml.Node) -> str:
         return "a mapping"
     if isinstance(node, yaml.SequenceNode):
         return f"a list of {len(node.value)}"
+    if len(node.value) > 80:
+        return f"{node.value[:77]!r}…"
     return repr(node.value) if node.value else "empty"
 
 

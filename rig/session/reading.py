@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.documents import parse_json
 from depthba.errors import OptionError
 from rig.session.marked import read_marked
 from rig.session.options import Session
@@ -37,11 +37,11 @@ def _transform(file: Path, session: Path) -> Array:
     """T_flange_camera (4, 4) of a file that holds it alone, or under that name."""
     who = f"{session}: hand_eye: {file}"
     try:
-        raw = json.loads(file.read_text(encoding="utf-8"))
+        raw = parse_json(file.read_text(encoding="utf-8"))
         T = np.array(raw["T_flange_camera"] if isinstance(raw, dict) else raw, dtype=float)
     except OSError as error:
         raise OptionError(f"{who}: {error.strerror}, expected JSON with T_flange_camera") from None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError):
         raise OptionError(f"{who}: no T_flange_camera in it, expected JSON with that 4x4") from None
     if T.shape != (4, 4) or not se3.is_rigid(T):
         raise OptionError(f"{who}: T_flange_camera is not rigid, expected a 4x4 in metres")
@@ -66,7 +66,7 @@ def read_taught(file: Path, joints: int, degrees: bool) -> Array:
         except ValueError:
             row = []
         if len(row) != joints or not np.isfinite(row).all():
-            raise OptionError(f"{file}:{number}: {line.strip()!r}, expected {joints} numbers")
+            raise OptionError(f"{file}:{number}: {line.strip()[:60]!r}, expected {joints} numbers")
         rows.append(row)
     if not rows:
         raise OptionError(f"{file}: no pose in it, expected one a line")

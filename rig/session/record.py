@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 from depthba import __version__, durable
 from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
+from depthba.dataset.faults import Faults
+from depthba.dataset.header import read_header
+from depthba.documents import parse_json
 from depthba.errors import DatasetError, OptionError
 from rig.cameras.camera import CameraInfo
 from rig.session.options import Session, plain
@@ -121,8 +124,10 @@ def stored_plan(path: Path, session: Session, space: Workspace, rehearsed: bool)
         DatasetError: the dataset was made by something else, or is no dataset.
         OptionError: the session has changed since; lists all that differs.
     """
-    header = Dataset.open(path).header
-    source = header.get("source")
+    # the header alone: a frame whose file was taken away since is for resuming to make good
+    found = read_header(path, Faults(path))
+    assert found is not None  # strict faults raise
+    source = found.raw.get("source")
     if not isinstance(source, Mapping) or source.get("tool") != TOOL or "plan" not in source:
         raise DatasetError(
             f"{path}: a dataset that no capture session began, expected none or one of this session"
@@ -187,8 +192,14 @@ def _read_skipped(path: Path) -> list[Skipped]:
         return []
     found = {}
     for line in lines[:-1]:
-        raw = json.loads(line)
-        found[raw["station"]] = Skipped(raw["station"], raw["label"], raw["reason"])
+        try:
+            raw = parse_json(line)
+            station, label, reason = int(raw["station"]), str(raw["label"]), str(raw["reason"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{path / SKIPPED}: {line[:60]!r}, expected a pose that was skipped"
+            ) from error
+        found[station] = Skipped(station, label, reason)
     return [found[station] for station in sorted(found)]
 
 

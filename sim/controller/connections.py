@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import socket
 import struct
 from typing import Any
 
+from depthba.documents import parse_json
 from sim.controller import dashboard, protocol
 from sim.controller.machine import Machine
 from sim.controller.protocol import DATA, INPUTS, OUTPUTS, Recipe, Value, message
@@ -15,6 +17,8 @@ from sim.errors import SimulationError
 
 _LAZY = 1 << 16
 """To a client that has so many bytes to read yet, no data are sent."""
+_LONGEST = 1 << 20
+"""No line and no program has more bytes; a client that sends more without an end is hung up on."""
 
 
 class Connection:
@@ -25,6 +29,13 @@ class Connection:
         self.peer, self.machine = peer, machine
         self.closed = False
         self._incoming, self._outgoing = bytearray(), bytearray()
+
+    def refuse_endless(self) -> None:
+        """SimulationError where what is not answered yet has grown too long."""
+        if len(self._incoming) > _LONGEST:
+            raise SimulationError(
+                f"{len(self._incoming)} bytes without an end, expected {_LONGEST} at most"
+            )
 
     def greet(self) -> None:
         """Say what such a port says first."""
@@ -91,10 +102,12 @@ class Rtde(Connection):
             self.send(message(kind, struct.pack(">4I", *self.machine.options.version)))
         elif kind == OUTPUTS:
             rate = struct.unpack_from(">d", content)[0]
+            if not math.isfinite(rate):
+                raise SimulationError(f"RTDE: data {rate} times a second, expected a number")
             self._period = 1.0 / min(max(rate, 1.0), self._limit)
-            self._outputs = Recipe.of(protocol.names_in(content[8:]))
-            number = int(self._outputs.valid)
-            self.send(message(kind, bytes([number]) + self._outputs.described()))
+            asked = Recipe.of(protocol.names_in(content[8:]))
+            self._outputs = asked if asked.valid else Recipe.of(())
+            self.send(message(kind, bytes([asked.valid]) + asked.described()))
         elif kind == INPUTS:
             recipe = Recipe.of(protocol.names_in(content), self.machine.taken)
             number = 0
@@ -138,6 +151,7 @@ class Script(Connection):
             script = bytes(self._incoming[: found.end()]).decode("latin1")
             del self._incoming[: found.end()]
             self.machine.take_script(script)
+        self.refuse_endless()
 
 
 class _Lines(Connection):
@@ -150,7 +164,8 @@ class _Lines(Connection):
             self._incoming = bytearray(rest)
             answer = self._answer(line.decode("utf-8", "replace"))
             if answer is not None:
-                self.send(answer.encode() + b"\n")
+                self.send(answer.encode("utf-8", "replace") + b"\n")
+        self.refuse_endless()
 
     def _answer(self, line: str) -> str | None:
         raise NotImplementedError
@@ -184,7 +199,7 @@ class Control(_Lines):
 
     def _answer(self, line: str) -> str | None:
         try:
-            request = json.loads(line)
+            request = parse_json(line)
             if not isinstance(request, dict):
                 raise ValueError(f"{line!r}: expected a JSON object")
             if request.get("do") in ("drop", "refuse", "kill"):
@@ -193,5 +208,5 @@ class Control(_Lines):
             if request.get("do") == "expose" and "blind" in self.machine.faults:
                 return None
             return json.dumps({"ok": True, **self.machine.obey(request)})
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             return json.dumps({"ok": False, "error": " ".join(str(error).split())})

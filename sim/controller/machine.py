@@ -65,7 +65,8 @@ class Machine:
             return
         try:
             self.program.step()
-        except ScriptError as error:
+        except (ScriptError, ValueError, ArithmeticError, LookupError) as error:
+            # whatever a program asks for ends that program, not the controller
             robot.notes.append(f"the program ended: {error}")
             self.program.over = True
         if self.program.over:
@@ -78,7 +79,11 @@ class Machine:
         if not robot.obeys:
             return
         robot.halt_program()
-        self.program = Program(robot, self.registers, script)
+        try:
+            self.program = Program(robot, self.registers, script)
+        except (ScriptError, ValueError) as error:
+            robot.notes.append(f"a program was refused: {error}")
+            return
         robot.runtime = Runtime.PLAYING
 
     def take_inputs(self, values: Mapping[str, float]) -> None:

@@ -26,6 +26,8 @@ REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 
 """Commands after which the script is ready at once: the client takes nothing back."""
 
 _RUNNING = 1 << 15
+_UPPER = "24"
+"""Where the upper half of the registers begins, which a second client uses."""
 _STOP_SCRIPT = 255
 
 
@@ -313,4 +315,6 @@ _OVER = object()
 def _offset(script: str, name: str) -> int:
     """Where the script's registers begin; the client writes a comment before the number."""
     found = re.search(rf"{name}\s*=(?:\s|#[^\n]*\n)*(\d+)", script)
+    if found and found[1].lstrip("0") not in ("", _UPPER):
+        raise ScriptError(f"{name} {found[1][:20]}, expected 0 or {_UPPER}")
     return int(found[1]) if found else 0

@@ -59,6 +59,9 @@ _TYPES |= {
     for k in range(48)
 }
 
+_LARGEST = 4096
+"""Bytes of the values of one recipe: all variables of a kind together have fewer."""
+
 NOT_FOUND, IN_USE = "NOT_FOUND", "IN_USE"
 
 
@@ -104,6 +107,10 @@ class Recipe:
         types = tuple(IN_USE if n in taken else _TYPES.get(n, NOT_FOUND) for n in names)
         layout = struct.Struct(">" + "".join(_FORMATS.get(t, "") for t in types))
         counts = tuple(int(_FORMATS.get(t, "")[:-1] or 1) for t in types)
+        if layout.size > _LARGEST:
+            raise SimulationError(
+                f"RTDE: {len(names)} variables of {layout.size} bytes, expected {_LARGEST} at most"
+            )
         return cls(tuple(names), types, layout, counts)
 
     @property

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -341,3 +342,14 @@ def test_damage_is_never_worse_than_a_known_error(
             assert faults, error
     finally:
         (pristine.path / file).write_bytes(whole)
+
+
+@pytest.mark.parametrize("file", ["dataset.json", "poses_measured.txt", "markers.json"])
+def test_a_link_out_of_the_dataset_is_refused_wherever_it_stands(
+    small: Any, tmp_path: Path, file: str
+) -> None:
+    (small.path / file).rename(tmp_path / "elsewhere")
+    (small.path / file).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DatasetError, match=f"{file}.* is a link out of the dataset"):
+        Dataset.open(small.path)
+    assert len(verify(small.path)) == 1

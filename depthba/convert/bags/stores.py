@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from depthba.convert.packages import package
-from depthba.errors import DatasetError
+from depthba.errors import DatasetError, DepthbaError
 
 
 class Store(Protocol):
@@ -49,12 +49,14 @@ class _Bag:
         connections = [c for c in self._reader.connections if c.topic in wanted]
         if not connections:  # none would mean all
             return
-        for connection, time, data in self._reader.messages(connections=connections):
+        found = self._reader.messages(connections=connections)
+        for connection, time, data in _whole(found, self._path):
             yield connection.topic, time, self._decoded(connection.msgtype, data, connection.topic)
 
     def message(self, topic: str, time: int) -> Any:
         connections = [c for c in self._reader.connections if c.topic == topic]
-        for connection, _, data in self._reader.messages(connections, start=time, stop=time + 1):
+        found = self._reader.messages(connections, start=time, stop=time + 1)
+        for connection, _, data in _whole(found, self._path):
             return self._decoded(connection.msgtype, data, topic)
         raise DatasetError(f"{self._path}: no message of {topic} at {time} ns")
 
@@ -100,13 +102,13 @@ class _Mcap:
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         wanted = [topic for topic in topics if topic in self.topics]
         if wanted:
-            for _, channel, message in self._reader.iter_messages(topics=wanted):
+            found = self._reader.iter_messages(topics=wanted)
+            for _, channel, message in _whole(found, self._path):
                 yield channel.topic, message.log_time, self._decoded(channel, message)
 
     def message(self, topic: str, time: int) -> Any:
-        for _, channel, message in self._reader.iter_messages(
-            topics=[topic], starting_at=time, ending_before=time + 1
-        ):
+        found = self._reader.iter_messages(topics=[topic], starting_at=time, ending_before=time + 1)
+        for _, channel, message in _whole(found, self._path):
             return self._decoded(channel, message)
         raise DatasetError(f"{self._path}: no message of {topic} at {time} ns")
 
@@ -124,6 +126,16 @@ class _Mcap:
     def __del__(self) -> None:
         if hasattr(self, "_file"):
             self._file.close()
+
+
+def _whole(found: Iterator[Any], path: Path) -> Iterator[Any]:
+    """Give what a library finds in a bag; whatever it throws becomes a known error."""
+    try:
+        yield from found
+    except DepthbaError:
+        raise
+    except Exception as error:  # broken bags fail in many ways
+        raise DatasetError(f"{path}: {error}, expected a whole bag") from error
 
 
 def _long(name: str) -> str:

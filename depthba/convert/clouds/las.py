@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import bounds
 from depthba.convert.packages import package
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
 
+_CHUNK = 1 << 18
+"""Points that are unpacked at once."""
+_RECORDS, _RECORD = 100, 54
+"""Byte of the head at which the number of variable-length records stands, and least size of one."""
 STEP = 1e-5
 """Of written coordinates, m; 32 bits of it reach over 40 km."""
 
@@ -20,10 +26,52 @@ def read(path: Path) -> Array:
     """Return the points (n, 3), units of the file."""
     laspy = package("laspy", "LAS")
     try:
-        cloud = laspy.read(path)
-    except (laspy.errors.LaspyException, OSError, ValueError) as error:
+        stored = path.stat().st_size
+        _check_records(path, stored)
+        with laspy.open(path, read_evlrs=False) as file:
+            header = file.header
+            if header.are_points_compressed:
+                _check_chunks(path, header.offset_to_point_data, header.point_count)
+            wanted = header.point_count * header.point_format.size
+            if not header.are_points_compressed and wanted > stored:
+                raise ValueError(f"{stored} bytes for {header.point_count} points")
+            bounds.check_packed(max(wanted, 24 * header.point_count), stored)
+            points = np.empty((header.point_count, 3))
+            at = 0
+            for chunk in file.chunk_iterator(_CHUNK):
+                points[at : at + len(chunk)] = np.column_stack([chunk.x, chunk.y, chunk.z])
+                at += len(chunk)
+        if at != len(points):
+            raise ValueError(f"{at} points, expected {len(points)} as its head says")
+    except Exception as error:  # broken files fail in many ways, some of them in another language
         raise DatasetError(f"{path}: {error}, expected a LAS or LAZ file") from error
-    return np.asarray(cloud.xyz, dtype=np.float64)
+    return points
+
+
+def _check_records(path: Path, stored: int) -> None:
+    """Refuse more records before the points than fit: the library would count to their number."""
+    with path.open("rb") as file:
+        head = file.read(_RECORDS + 4)
+    if len(head) < _RECORDS + 4:
+        raise ValueError(f"{stored} bytes, cut off in its head")
+    (records,) = struct.unpack_from("<I", head, _RECORDS)
+    if records * _RECORD > stored:
+        raise ValueError(f"{records} records in {stored} bytes")
+
+
+def _check_chunks(path: Path, begin: int, points: int) -> None:
+    """Refuse a table of more chunks than points, for which the library would end the process."""
+    data = path.read_bytes()
+    if len(data) < begin + 8:
+        raise ValueError("cut off before its points")
+    (at,) = struct.unpack_from("<q", data, begin)
+    if at == -1:  # written to what could not go back: it stands at the end
+        (at,) = struct.unpack_from("<q", data, len(data) - 8)
+    if not begin + 8 <= at <= len(data) - 8:
+        raise ValueError(f"its table of chunks at byte {at} of {len(data)}")
+    _, chunks = struct.unpack_from("<II", data, at)
+    if chunks > points + 1:
+        raise ValueError(f"{chunks} chunks of {points} points")
 
 
 def write(path: Path, points: Array, colours: NDArray[np.uint8] | None) -> None:

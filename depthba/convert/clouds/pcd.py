@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba import se3
+from depthba import bounds, se3
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -35,6 +35,8 @@ def parse(data: bytes, name: str) -> Pcd:
         sizes = [int(v) for v in header["SIZE"]]
         counts = [int(v) for v in header.get("COUNT", ["1"] * len(fields))]
         number = int(header["POINTS"][0])
+        if number < 0 or min(counts) < 1:
+            raise ValueError(f"{number} points, {counts} numbers each")
         view = [float(v) for v in header.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])]
         dtype = np.dtype(
             [
@@ -133,6 +135,10 @@ def _unpacked(body: bytes, name: str) -> NDArray[np.uint8]:
     packed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
     if len(body) < 8 + packed:
         raise DatasetError(f"{name}: {len(body) - 8} bytes of compressed data, expected {packed}")
+    try:
+        bounds.check_packed(size, len(body))
+    except ValueError as error:
+        raise DatasetError(f"{name}: {error}") from error
     out = np.zeros(size, np.uint8)
     if _lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:
         raise DatasetError(f"{name}: compressed data cannot be unpacked to {size} bytes")

@@ -49,6 +49,8 @@ def read(path: Path, reading: Reading) -> Recording:
         times.append(time)
         frame_id = message.header.frame_id
         first = first or message
+    if first is None:
+        raise DatasetError(f"{path}: no message of {topic}, expected depth images")
     names = [f"{topic} at {stamp:.6f} s" for stamp in stamps]
     shape = depth_images.decode(first, unit, names[0]).shape
     if reading.intrinsics is not None:
@@ -56,8 +58,10 @@ def read(path: Path, reading: Reading) -> Recording:
         camera = made(shape[1], shape[0], reading.intrinsics, distortion, "--intrinsics")
     else:
         info = _info_topic(store, topic, path)
-        message = next(iter(store.messages([info])))[2]
-        camera = depth_images.camera(message, "rect" in topic, f"{path}: {info}")
+        told = next(iter(store.messages([info])), None)
+        if told is None:
+            raise DatasetError(f"{path}: no message of {info}, expected --intrinsics FX FY CX CY")
+        camera = depth_images.camera(told[2], "rect" in topic, f"{path}: {info}")
     tree = tf.Tree(store, path)
     if reading.poses is not None:
         poses = pose_files.read(Path(reading.poses))

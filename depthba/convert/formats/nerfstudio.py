@@ -6,6 +6,7 @@ centres are at half-integer coordinates there, so half a pixel is taken off cx a
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -51,18 +52,18 @@ def read(path: Path, reading: Reading) -> Recording:
     cameras: dict[tuple[float, ...], Camera] = {}
     for k, entry in enumerate(raw):
         if not isinstance(entry, dict):
-            raise DatasetError(f"{file}: frames[{k}] is {entry!r}, expected an object")
+            raise DatasetError(f"{file}: frames[{k}] is {str(entry)[:60]!r}, expected an object")
         name = str(entry.get("file_path", f"frames[{k}]"))
         if not entry.get("depth_file_path"):
             without.append(name)
             continue
-        depth = root / str(entry["depth_file_path"])
+        depth = files.named(root, str(entry["depth_file_path"]), file, reading.outside)
         size = files.image_size(depth) if not cameras or "w" in entry else None
-        colour = root / name
+        colour = files.named(root, name, file, reading.outside)
         frames.append(
             SourceFrame(
                 name=depth.name,
-                stamp=float(entry.get("timestamp", k)),
+                stamp=_stamp(entry.get("timestamp", k), f"{file}: frames[{k}]"),
                 pose=_pose(entry, f"{file}: frames[{k}]"),
                 depth=files.depth_image(depth, scale, floats=depth.suffix == ".npy"),
                 rgb=files.colour_image(colour) if colour.is_file() and colour != depth else None,
@@ -136,6 +137,12 @@ def _number(value: dict[str, Any], key: str, default: float, file: Path) -> floa
     return float(found)
 
 
+def _stamp(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DatasetError(f"{where}.timestamp is {value!r}, expected finite seconds")
+    return float(value)
+
+
 def _pose(entry: dict[str, Any], where: str) -> Array:
     try:
         T = np.array(entry["transform_matrix"], dtype=np.float64)
@@ -183,9 +190,9 @@ def _camera(
             next(iter(known.values())).height,
         )
         for name, found in (("w", width), ("h", height)):
-            if name in values and int(values[name]) != found:
+            if name in values and values[name] != found:
                 raise DatasetError(
-                    f"{where}: {name} is {values[name]}, but depth images have {found} pixels: "
+                    f"{where}: {name} is {values[name]!r}, but depth images have {found} pixels: "
                     "expected depth of the colour's size, or --intrinsics of the depth images"
                 )
         known[key] = intrinsics.made(width, height, lens, reading.distortion or tuple(told), where)

@@ -42,8 +42,8 @@ def recognise(path: Path) -> str:
 
 def read(path: Path, reading: Reading) -> Recording:
     """Read a sequence."""
-    depth = _listing(path / "depth.txt")
-    colour = _listing(path / "rgb.txt") if (path / "rgb.txt").is_file() else []
+    depth = _listing(path / "depth.txt", reading)
+    colour = _listing(path / "rgb.txt", reading) if (path / "rgb.txt").is_file() else []
     poses = pose_files.read(Path(reading.poses) if reading.poses else path / POSES)
     if poses.stamps is None:
         raise DatasetError(f"{poses.path}: poses without stamps, expected TUM: stamp tx … qw")
@@ -97,7 +97,7 @@ def write(dataset: Dataset, T_world_camera: Array, path: Path) -> None:
     trajectory.write_tum(path / POSES, dataset.stamps, T_world_camera)
 
 
-def _listing(path: Path) -> list[tuple[float, Path]]:
+def _listing(path: Path, reading: Reading) -> list[tuple[float, Path]]:
     """Return stamps and files of such as depth.txt."""
     out = []
     for at, line in enumerate(files.text(path).splitlines(), 1):
@@ -105,11 +105,12 @@ def _listing(path: Path) -> list[tuple[float, Path]]:
         if not words:
             continue
         try:
-            out.append((float(words[0]), path.parent / words[1]))
+            stamp, name = float(words[0]), words[1]
         except (ValueError, IndexError):
             raise DatasetError(
                 f"{path}: line {at}: {line[:60]!r}, expected a stamp and a file name"
             ) from None
+        out.append((stamp, files.named(path.parent, name, path, reading.outside)))
     if not out:
         raise DatasetError(f"{path}: lists no image")
     return out

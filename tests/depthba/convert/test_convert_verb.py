@@ -166,10 +166,15 @@ def test_the_mesh_is_the_map(run: Path, tmp_path: Path) -> None:
     assert len(up.faces) == len(mesh.faces) > 100
 
 
-def test_a_run_becomes_a_dataset_of_another_format_at_its_poses(run: Path, tmp_path: Path) -> None:
+def test_a_run_becomes_a_dataset_of_another_format_at_its_poses(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["convert", str(run), str(tmp_path / "transforms.json")]) == 0
     back = tmp_path / "back"
-    assert cli.main(["convert", str(tmp_path / "transforms.json"), str(back)]) == 0
+    # its images lie where they lay: to read them again is to be asked for
+    assert cli.main(["convert", str(tmp_path / "transforms.json"), str(back)]) == 1
+    assert "leads out of" in capsys.readouterr().err
+    assert cli.main(["convert", str(tmp_path / "transforms.json"), str(back), "--outside"]) == 0
     dataset, opened = Dataset.open(back), Run.open(run)
     assert_allclose(dataset.T_world_camera_measured, opened.T_world_camera, rtol=0, atol=1e-9)
     assert_array_equal(dataset[3].depth(), Dataset.open(run / "dataset")[3].depth())
