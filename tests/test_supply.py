@@ -27,6 +27,8 @@ IMPORTS = {
     "laspy": "laspy", "mcap": "mcap", "pye57": "pye57", "rosbags": "rosbags",
     "tifffile": "tifffile", "trimesh": "trimesh",
     "dask": "dask", "distributed": "distributed",
+    "latex2mathml": "latex2mathml", "mkdocs-material": "material",
+    "mkdocstrings-python": "mkdocstrings_handlers",
 }  # fmt: skip
 """Import name of what the extras bring."""
 BASE = {"matplotlib", "numba", "numpy", "cv2", "PIL", "yaml", "rich", "scipy", "small_gicp", "tyro"}
