@@ -79,7 +79,8 @@ def opened(
         if taken_up is None:
             # A gantry that does not know where it is will stand at 0 once it was homed.
             here = standing.joints if standing.known else np.zeros_like(standing.joints)
-            taken_up = plan(stored, space, here if space.rest is None else space.rest)
+            start = here if space.rest is None else space.rest
+            taken_up = plan(stored, space, start, lambda: opening.result().camera)
         info = opening.result()
         stack.callback(camera.close)
         _refuse_full_disk(out, info, len(taken_up.joints), session.colour)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from depthba import __version__, durable
 from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
+from depthba.dataset.extras import CALIBRATION
 from depthba.errors import DatasetError, OptionError
 from rig.cameras.camera import CameraInfo
 from rig.session.options import Session, plain
@@ -106,7 +107,15 @@ def begin(
     }
     if session.pose_noise is not None:
         header["pose_noise"] = plain(session.pose_noise)
-    return DatasetWriter.create(path, header)
+    writer = DatasetWriter.create(path, header)
+    write_board(writer, session)
+    return writer
+
+
+def write_board(writer: DatasetWriter, session: Session) -> None:
+    """Write calibration.json where the session looks at a board and there is none yet."""
+    if session.board is not None and not (writer.path / CALIBRATION).exists():
+        writer.write_calibration({"board": session.board.json()})
 
 
 def holds_dataset(path: Path) -> bool:

@@ -136,6 +136,7 @@ def _capture(
     path = arguments.out
     if ready.begun:
         writer = record.resume(path, ready.info)
+        record.write_board(writer, session)
         for warning in writer.warnings:
             note(f"warning: {warning}")
     else:
