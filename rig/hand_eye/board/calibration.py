@@ -26,6 +26,7 @@ from rig.hand_eye.board.verdict import (
     Tested,
     Verdict,
     judge,
+    odds_of_stated,
     tested_clock,
 )
 from rig.hand_eye.board.views import NextView, next_view
@@ -58,8 +59,9 @@ class BoardOptions:
     """What the camera is fixed to: eye-in-hand, the flange, with the board standing still;
     eye-to-hand, the world, with the board on the flange."""
     intrinsics: Intrinsics = "prior"
-    """The camera's numbers: prior, those of dataset.json, known to 0.1 %; fixed, those exactly;
-    estimated, from the images alone, with the lens's distortion."""
+    """The camera's numbers: prior, those of dataset.json, taken as exact where the images speak for
+    that and else known to 0.1 %; fixed, those exactly; estimated, from the images alone, with the
+    lens's distortion."""
     robot_sigma: tuple[float, float] | None = None
     """How well the robot repeats a flange pose: standard deviations along and about each axis, m
     and degrees. None: found from the data, about 0.00005 m and 0.01 degrees."""
@@ -189,6 +191,11 @@ def calibrate(
             f"the camera's stamps are {1e3 * clock.value:+.1f} ms off the robot's (sigma"
             f" {1e3 * clock.sigma:.1f}): this was put right"
         )
+    odds = 0.0
+    if options.intrinsics == "prior" and (odds := odds_of_stated(found.solution)) > 1.0:
+        exact = replace(found.solution.problem.prior, lens=Prior().lens)
+        found = estimate(observations, beginning, P, exact, stated)
+        notes.append(f"the camera's numbers were taken as exact: odds of {odds:.3g} to 1 for that")
     if observations.stamps is not None and observations.stamps_robot is not None:
         notes += _stamp_notes(observations)
     away = np.linalg.norm(P[:, :3, 3], axis=1)

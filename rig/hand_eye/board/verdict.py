@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from depthba.optimiser.certainty import direction_name
 from rig.hand_eye.board.chain import CLOCK, LENS, SIZE, X
 from rig.hand_eye.board.estimate import UNLIKELY, Estimate
+from rig.hand_eye.board.noise import Prior
 from rig.hand_eye.board.refine import Solution, minimise
 from rig.hand_eye.board.views import displacement
 from rig.hand_eye.flanges import motion_fault, turned
@@ -108,8 +109,23 @@ def lens_fault(solution: Solution) -> str:
     )
 
 
-def _tested(solution: Solution, prior: object, index: int) -> Tested | None:
-    problem = replace(solution.problem, prior=prior)  # type: ignore[arg-type]
+def odds_of_stated(solution: Solution) -> float:
+    """Return the odds that the camera is as stated, against one that is off as the prior has it.
+
+    Of two hypotheses, one inside the other, the posterior over the prior density at what is stated
+    (Dickey 1971). Even odds before.
+    """
+    sigma = np.array(solution.problem.prior.lens)
+    bound = np.flatnonzero(sigma > 0)
+    off = solution.chain.lens[bound] / sigma[bound]
+    rows = LENS.start + bound
+    C = solution.covariance[np.ix_(rows, rows)] / np.outer(sigma[bound], sigma[bound])
+    log = -0.5 * (off @ np.linalg.solve(C, off) + np.linalg.slogdet(C)[1])
+    return float(np.exp(np.clip(log, -700.0, 700.0)))
+
+
+def _tested(solution: Solution, prior: Prior, index: int) -> Tested | None:
+    problem = replace(solution.problem, prior=prior)
     free = minimise(problem, solution.chain, 20)
     sigma = float(np.sqrt(free.covariance[index, index]))
     if sigma > 0.3:
