@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rig.axes.axes import AxesState, Axis
-from rig.axes.grbl_words import Report, alarm_words, code_of, error_words, parse_report
+from rig.axes.grbl_words import (
+    HOMING,
+    Report,
+    alarm_words,
+    code_of,
+    error_words,
+    homing_time,
+    parse_report,
+)
 from rig.axes.limits import check_axes, check_speed, check_target
 from rig.axes.serial_link import SerialLink
 from rig.axes.watching import Patience, braked_on_failure, watch_move
@@ -48,8 +56,9 @@ class GrblOptions:
     """For the greeting; a board that restarts when its port is opened needs two seconds."""
     reply_timeout: float = 1.0
     """For the answer to a line or a report, s."""
-    home_timeout: float = 60.0
-    """For `$H`. The controller says nothing meanwhile, so this is what ends it where it hangs."""
+    home_timeout: float | None = None
+    """For `$H`, s. The controller says nothing meanwhile, so this is what ends it where it hangs.
+    None: reckoned from the controller's travel ($130 to $132) and homing speeds ($24, $25)."""
     patience: Patience = field(default_factory=Patience)
 
 
@@ -74,6 +83,7 @@ class GrblGantry:
         self._lock = threading.RLock()
         self._homed = False
         self._homing = False
+        self._home_timeout = HOMING
         self._held = False
         self._alarm: int | None = None
         self._offset: Array = np.zeros(3)
@@ -95,6 +105,7 @@ class GrblGantry:
             try:
                 self._reset()
                 settings = self._settings()
+                self._home_timeout = self._options.home_timeout or homing_time(settings)
             except AxesError:
                 self.disconnect()
                 raise
@@ -120,7 +131,7 @@ class GrblGantry:
             try:
                 if self._stops != before:
                     raise AxesError(f"{self._who}: stopped on request before homing")
-                self._line("$H", self._options.home_timeout)
+                self._line("$H", self._home_timeout)
             except BaseException as error:
                 self._end_motion()
                 if isinstance(error, AxesError) and self._stops != before:
@@ -282,8 +293,17 @@ class GrblGantry:
                 if self._note_alarm(line):
                     raise AxesError(f"{self._who}: alarm: {alarm_words(self._alarm)}")
                 said.append(line)
+            why = f"no answer to {text!r} within {timeout:.3g} s"
+            if self._homing:
+                with suppress(AxesError):  # the link is gone as well, and there is more to tell
+                    link.send(_RESET)
+                why = (
+                    f"homing says nothing for {timeout:.3g} s, longer than its travel and speed"
+                    " allow, and was stopped; expected the switches to be found: see to them and"
+                    " to the axes, or set home_timeout"
+                )
             self.disconnect()
-            raise AxesError(f"{self._who}: no answer to {text!r} within {timeout:g} s")
+            raise AxesError(f"{self._who}: {why}")
 
     def _report(self) -> Report:
         with self._lock:

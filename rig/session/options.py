@@ -144,7 +144,7 @@ class Rehearsal:
     """What ``--rehearse`` puts in place of the hardware."""
 
     scene: str = "lab-1"
-    """As `depthba generate` takes it; around an arm."""
+    """As `depthba generate` takes it: around an arm as lab-1, under a gantry as industrial-4."""
     seed: int = 0
     """Of the scene and of the camera's noise."""
     sensor: str | None = None
@@ -154,7 +154,11 @@ class Rehearsal:
     joints: tuple[float, float, float, float, float, float] | None = None
     """Where the simulated arm stands at the start, rad. None: where it stands by itself."""
     joint_offset: float = 0.0
-    """Standard deviation of each joint's zero, rad, which nobody knows."""
+    """Standard deviation of each joint's zero, rad, or axis's, m, which nobody knows."""
+    mounting_t: float = 0.002
+    mounting_r_deg: float = 0.3
+    """Of a gantry: how far its camera sits from where `hand_eye` has it. An arm's sits where the
+    model of the arm has it."""
 
 
 @dataclass(frozen=True)

@@ -359,7 +359,10 @@ def _length(joints: Array, start: Array) -> float:
 
 
 def _listed(refused: list[tuple[str, str]], count: int) -> str:
-    each = "; ".join(f"{label}: {reason}" for label, reason in refused)
+    alike: dict[str, list[str]] = {}
+    for label, reason in refused:
+        alike.setdefault(reason, []).append(label)
+    each = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in alike.items())
     return (
         f"{len(refused)} of {count} poses cannot be taken, expected all of them"
         f" (or unreachable: leave out): {each}"

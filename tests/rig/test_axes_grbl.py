@@ -18,7 +18,14 @@ if not hasattr(os, "openpty"):
     pytest.skip("no pseudo-terminals here", allow_module_level=True)
 
 from rig.axes import Axes, Axis, GrblGantry, GrblOptions, Patience
-from rig.axes.grbl_words import alarm_words, code_of, error_words, parse_report
+from rig.axes.grbl_words import (
+    HOMING,
+    alarm_words,
+    code_of,
+    error_words,
+    homing_time,
+    parse_report,
+)
 from rig.errors import AxesError
 from tests.rig.peers import ends_in_time, peer
 
@@ -169,6 +176,32 @@ def test_homing_that_finds_no_switch() -> None:
         pytest.raises(AxesError, match=r"no switch found \(ALARM:9\)"),
     ):
         axes.home()
+
+
+def test_homing_that_stays_silent_ends_by_the_controllers_own_settings() -> None:
+    mechanics = ("--mechanics.upper", "0.2", "0.1", "--mechanics.homing-speed", "2")
+    words = (*mechanics, "--mechanics.creep-speed", "0.5", "--mute-homing")
+    axes = (Axis("x", 0.0, 0.195, 0.5), Axis("y", 0.0, 0.095, 0.4))
+    with peer("sim.axes.grbl_device", *words) as (_, port):
+        found = GrblGantry(GrblOptions(port, axes, origin=(-0.2, -0.1), patience=PATIENT))
+        found.connect()
+        said = r"homing says nothing for 3\.\d+ s, longer than its travel and speed allow, and was"
+        with ends_in_time(), pytest.raises(AxesError, match=said) as caught:
+            found.home()
+        assert "\n" not in str(caught.value)
+        # It was reset: who connects anew finds no axes that still look for their switches.
+        found.connect()
+        state = found.status()
+        assert not state.moving and state.alarm is not None
+        found.disconnect()
+
+
+def test_how_long_homing_may_take() -> None:
+    # A metre and a half, 0.9 m, 0.2 m at 2 m/min: 1.5 times as far, then the switches anew.
+    settings = {"$130": "1500.000", "$131": "900.000", "$132": "200.000"}
+    settings |= {"$24": "100.000", "$25": "2000.000", "$27": "2.000"}
+    assert homing_time(settings) == pytest.approx(1.2 * (1.5 * 2600 / 2000 + 0.6) * 60 + 3)
+    assert homing_time({**settings, "$25": "0"}) == homing_time({}) == HOMING
 
 
 def test_no_port_busy_silent_and_not_fit_for_it() -> None:
