@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rig.axes.axes import AxesState, Axis
 from rig.axes.grbl_words import (
@@ -25,9 +25,8 @@ from rig.axes.grbl_words import (
     homing_time,
     parse_report,
 )
-from rig.axes.limits import check_axes, check_speed, check_target
 from rig.axes.serial_link import SerialLink
-from rig.axes.watching import Patience, braked_on_failure, watch_move
+from rig.axes.watching import Patience, WatchedAxes
 from rig.errors import AxesError
 
 Array = NDArray[np.float64]
@@ -62,7 +61,7 @@ class GrblOptions:
     patience: Patience = field(default_factory=Patience)
 
 
-class GrblGantry:
+class GrblGantry(WatchedAxes):
     """`rig.axes.axes.Axes` on a GRBL 1.1 controller with homing ($22=1).
 
     The stamp of a state is the host's clock when its report arrived. Threads may share one; `stop`
@@ -70,7 +69,7 @@ class GrblGantry:
     """
 
     def __init__(self, options: GrblOptions):
-        check_axes(options.axes)
+        super().__init__(options.axes, options.patience, f"gantry {options.port}")
         names = [axis.name for axis in options.axes]
         if set(names) - set(_LETTERS):
             raise AxesError(f"axes {', '.join(names)}, expected some of x, y, z")
@@ -87,12 +86,6 @@ class GrblGantry:
         self._held = False
         self._alarm: int | None = None
         self._offset: Array = np.zeros(3)
-        self._stops = 0
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Names and limits."""
-        return self._options.axes
 
     def connect(self) -> None:
         """Reset the controller, read its greeting and settings. It moves nothing.
@@ -129,8 +122,7 @@ class GrblGantry:
                 self._reset()
             self._homing = True
             try:
-                if self._stops != before:
-                    raise AxesError(f"{self._who}: stopped on request before homing")
+                self._refuse_stopped(before, "before homing")
                 self._line("$H", self._home_timeout)
             except BaseException as error:
                 self._end_motion()
@@ -163,50 +155,6 @@ class GrblGantry:
             alarm=alarm,
         )
 
-    def position(self) -> Array:
-        """(n,) m, now."""
-        return self.status().position
-
-    def move_to(self, target: ArrayLike, *, speed: float) -> AxesState:
-        """Go to a position (n,), m, along a straight line, at `speed` m/s."""
-        before = self._stops
-        position = check_target(self.axes, target)
-        check_speed(self.axes, speed)
-        with self._lock:
-            if self._held:
-                self._reset()
-            state = self.status()
-            if not self._homed:
-                why = f" ({alarm_words(self._alarm)})" if self._alarm is not None else ""
-                raise AxesError(
-                    f"{self._who}: the axes are not homed{why}, expected home() before a move"
-                )
-            if state.alarm is not None:
-                raise AxesError(f"{self._who}: {state.alarm}; see to it, then home the axes")
-        places = "".join(
-            f"{axis.name.upper()}{1e3 * value:.3f}"
-            for axis, value in zip(self.axes, position + self._origin, strict=True)
-        )
-        try:
-            with braked_on_failure(self.stop):
-                with self._lock:
-                    if self._stops != before:
-                        raise AxesError(f"{self._who}: stopped on request before the move began")
-                    # mm, absolute, per minute, in the machine's frame
-                    line = f"G21G90G94G53G1{places}F{60e3 * speed:.1f}"
-                    self._line(line, self._options.reply_timeout)
-                return watch_move(
-                    self.status,
-                    self.axes,
-                    position,
-                    self._options.patience,
-                    lambda: self._stops != before,
-                    self._who,
-                )
-        except AxesError:
-            self._end_motion()
-            raise
-
     def stop(self) -> None:
         """Brake now, and end the move that is under way in another thread. Never raises.
 
@@ -229,9 +177,21 @@ class GrblGantry:
             if link is not None:
                 link.close()
 
-    @property
-    def _who(self) -> str:
-        return f"gantry {self._options.port}"
+    def _awake(self) -> AxesState:
+        with self._lock:
+            if self._held:
+                self._reset()
+            return self.status()
+
+    def _start(self, position: Array, speed: float, before: int) -> None:
+        places = "".join(
+            f"{axis.name.upper()}{1e3 * value:.3f}"
+            for axis, value in zip(self.axes, position + self._origin, strict=True)
+        )
+        with self._lock:
+            self._refuse_stopped(before, "before the move began")
+            # mm, absolute, per minute, in the machine's frame
+            self._line(f"G21G90G94G53G1{places}F{60e3 * speed:.1f}", self._options.reply_timeout)
 
     def _open(self) -> SerialLink:
         if self._link is None:
