@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from depthba.optimiser.certainty import direction_name
@@ -117,8 +116,7 @@ def camera_doubt(solution: Solution) -> float:
 
     How wrong given numbers usually are nobody knows: they may be exact. Each of `DOUBTS` is a prior
     as narrow, all alike before; each is worth its evidence, the density that it gave to what the
-    images say (MacKay 1992), by the normal approximation to that. What is returned leaves as many
-    of the camera's numbers to the images as all of these do on average.
+    images say (MacKay 1992), by the normal approximation to that. Returned is the root mean square.
     """
     sigma = np.array(solution.problem.prior.lens)
     bound = np.flatnonzero(sigma > 0)
@@ -132,12 +130,7 @@ def camera_doubt(solution: Solution) -> float:
     narrowed = 1.0 + square * precision
     log = 0.5 * (square * pull**2 / narrowed - np.log(narrowed)).sum(axis=1)
     weight = np.exp(log - log.max())
-    left = float(weight @ (1.0 - 1.0 / narrowed).sum(axis=1) / weight.sum())
-
-    def short(doubt: float) -> float:
-        return float((1.0 - 1.0 / (1.0 + doubt**2 * precision)).sum()) - left
-
-    return 1.0 if short(1.0) <= 0.0 else float(brentq(short, 0.0, 1.0))
+    return float(np.sqrt(weight @ np.square(DOUBTS) / weight.sum()))
 
 
 def _tested(solution: Solution, prior: Prior, index: int) -> Tested | None:
