@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from depthba.dataset import is_dataset
 from depthba.errors import DatasetError
 from rig.cameras.apart import CameraApart
 from rig.cameras.camera import CameraInfo
 from rig.session.carriers import Carrier, make_carrier
 from rig.session.options import Session, plain
 from rig.session.planning import Plan, plan
-from rig.session.record import holds_dataset, stored_plan
+from rig.session.record import stored_plan
 from rig.session.workspace import Workspace
 
 SPARE = 16_000_000
@@ -54,7 +55,7 @@ def opened(
     """
     carrier = make_carrier(session.rig, session.motion)
     space = Workspace.of(session, carrier.body)
-    begun = holds_dataset(out)
+    begun = is_dataset(out)
     taken_up = stored_plan(out, stored, space, rehearsed) if begun else None
     if not begun:
         _refuse_others(out)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import __version__, durable
-from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
 from depthba.dataset.extras import CALIBRATION
 from depthba.errors import DatasetError, OptionError
@@ -118,11 +117,6 @@ def write_board(writer: DatasetWriter, session: Session) -> None:
         writer.write_calibration({"board": session.board.json()})
 
 
-def holds_dataset(path: Path) -> bool:
-    """Whether a dataset was begun in a folder."""
-    return (path / "dataset.json").is_file()
-
-
 def stored_plan(path: Path, session: Session, space: Workspace, rehearsed: bool) -> Plan:
     """The plan of a dataset that this session began.
 
@@ -211,17 +205,10 @@ def _finish_line(file: Path) -> None:
 
 
 def _sensor(info: CameraInfo) -> dict[str, Any]:
-    camera: Camera = info.camera
     sensor: dict[str, Any] = {
         "kind": "depth",
         "model": info.model,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
+        **info.camera.json(),
         "depth_scale": info.depth_scale,
     }
     for name in ("depth_min", "depth_max"):

@@ -92,7 +92,8 @@ def run(arguments: Arguments) -> int:
     else:
         print("\n".join(_text(summary)))
     if viewer is not None:
-        viewer.stay()
+        with interrupts.heard():
+            viewer.stay()
     return DONE if summary.complete else NOT_TO_BE_TRUSTED
 
 
