@@ -223,7 +223,7 @@ def serve(options: Options) -> None:
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     device = GrblDevice(options)
-    tell(options.stage, lambda: device.carriage.position(options.rate * time.monotonic()))
+    tell(options.stage, lambda: device.carriage.glimpse(options.rate * time.monotonic()))
     if options.end_with_parent:
         end_with_parent()
     print(f"listening on {os.ttyname(theirs)}", flush=True)

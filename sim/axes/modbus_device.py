@@ -137,7 +137,7 @@ async def serve(options: Options) -> None:
         ) from error
     check_loopback(options.host)
     device = ModbusDevice(options)
-    tell(options.stage, lambda: device.carriage.position(options.rate * time.monotonic()))
+    tell(options.stage, lambda: device.carriage.glimpse(options.rate * time.monotonic()))
     if options.end_with_parent:
         end_with_parent()
 
