@@ -172,6 +172,27 @@ class Board:
         cell = np.ones((pixels_per_square, pixels_per_square), np.uint8)
         return np.pad(np.kron(squares, cell), rim, constant_values=255)
 
+    def marker_cells(self) -> Array:
+        """The markers' black cells, in rows: (n, 4), x0 y0 x1 y1, m, board frame."""
+        if self.kind == "checkerboard":
+            return np.zeros((0, 4))
+        import cv2
+
+        dictionary, boxes = self._charuco.getDictionary(), []
+        cells = dictionary.markerSize + 2
+        side = (self.marker_m or 0.0) / cells
+        # OpenCV measures from the print's corner, a square before the first inner one.
+        for number, corners in zip(
+            self._charuco.getIds(), self._charuco.getObjPoints(), strict=True
+        ):
+            x, y = np.asarray(corners, float)[:, :2].min(axis=0) - self.square_m
+            cell = cv2.aruco.generateImageMarker(dictionary, int(number), cells, borderBits=1) == 0
+            for row, line in enumerate(np.pad(cell, ((0, 0), (1, 1))).astype(int)):
+                step = np.diff(line)
+                for a, b in zip(np.flatnonzero(step > 0), np.flatnonzero(step < 0), strict=True):
+                    boxes.append((x + a * side, y + row * side, x + b * side, y + (row + 1) * side))
+        return np.array(boxes)
+
     def detect(self, image: Image) -> tuple[NDArray[np.int64], Array]:
         """Ids (n,) and pixels (n, 2), (u, v), of the inner corners in an image uint8, grey or RGB.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,11 @@ class Camera:
     def matrix(self) -> Array:
         """The (3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def json(self) -> dict[str, Any]:
+        """Return what dataset.json holds of it."""
+        sizes = {name: getattr(self, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        return {**sizes, "distortion": list(self.distortion)}
 
     def rays(self) -> Array:
         """Return the undistorted ray of each pixel, (height, width, 3), z = 1; read-only.

@@ -181,7 +181,6 @@ def _listed(versions: dict[str, str]) -> str:
 
 def _header(scene: str, entry: Scene, capture: Capture) -> dict[str, Any]:
     sensor, track, options = capture.sensor, capture.track, capture.options
-    camera = sensor.camera
     header: dict[str, Any] = {
         "format": "depthba-dataset",
         "version": 1,
@@ -189,8 +188,7 @@ def _header(scene: str, entry: Scene, capture: Capture) -> dict[str, Any]:
         "sensor": {
             "kind": "depth",
             "model": sensor.model,
-            **{k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")},
-            "distortion": list(camera.distortion),
+            **sensor.camera.json(),
             "depth_scale": sensor.depth_scale,
             "depth_min": sensor.depth_min,
             "depth_max": sensor.depth_max,

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-try:
+# On Windows nothing is locked, and a second writer is found out as it writes.
+if sys.platform != "win32":
     import fcntl
-except ImportError:  # Windows: nothing is locked, and a second writer is found out as it writes
-    fcntl = None  # type: ignore[assignment]
 
 
 class TakenError(Exception):
@@ -44,7 +44,7 @@ def _take(path: Path, wait: bool) -> int:
             path.parent.mkdir(parents=True, exist_ok=True)
             fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                if fcntl is not None:
+                if sys.platform != "win32":
                     fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
                 # The one who held it before may have removed the file that we waited for.
                 if os.path.samestat(os.fstat(fd), os.stat(path)):
@@ -54,7 +54,7 @@ def _take(path: Path, wait: bool) -> int:
                 os.close(fd)
                 raise TakenError(text) from None
             except FileNotFoundError:
-                pass
+                pass  # removed while we waited for it: once more
             except BaseException:
                 os.close(fd)
                 raise

@@ -205,6 +205,7 @@ class ClusterWorkers:
 
     def stop(self, now: bool) -> None:
         """Give back what is not begun, and leave; the workers belong to others."""
+        # A cluster that is gone throws in many ways, and gives back nothing.
         with contextlib.suppress(Exception):
             self._executor.shutdown(wait=False)
         self._client.close()

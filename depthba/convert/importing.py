@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import __version__
-from depthba.camera import Camera
 from depthba.convert import files, overlap, registry
 from depthba.convert.reading import Reading
 from depthba.convert.recording import Recording, SourceFrame
-from depthba.dataset import Dataset, DatasetWriter
+from depthba.dataset import Dataset, DatasetWriter, is_dataset
 from depthba.dataset.sensor import DEPTH_LARGEST
 from depthba.errors import DatasetError, OptionError
+
+__all__ = ["Imported", "into_dataset", "is_dataset", "read"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -33,11 +34,6 @@ class Imported:
     dataset: Dataset
     format: str
     notes: tuple[str, ...]
-
-
-def is_dataset(path: Path) -> bool:
-    """Tell whether a folder is a dataset of depthba, whole or not."""
-    return (path / "dataset.json").is_file()
 
 
 def read(path: Path, reading: Reading) -> Recording:
@@ -91,7 +87,7 @@ def into_dataset(
         if scale is None:
             scale = _step(recording)
             notes.append(f"depth kept in steps of {scale:g} m")
-        sensor |= {"kind": "depth", **_lens(camera), "depth_scale": scale}
+        sensor |= {"kind": "depth", **camera.json(), "depth_scale": scale}
     header = {
         "name": recording.path.resolve().stem or recording.format,
         "sensor": sensor,
@@ -164,15 +160,3 @@ def _step(recording: Recording) -> float:
         f"{recording.path}: depth up to {farthest:g} m, expected at most "
         f"{DEPTH_LARGEST * STEPS[-1]:g} m: is --depth-scale right?"
     )
-
-
-def _lens(camera: Camera) -> dict[str, Any]:
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-    }

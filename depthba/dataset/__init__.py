@@ -2,7 +2,7 @@
 
 from depthba.dataset.faults import Fault
 from depthba.dataset.model import Frame, Marker, StoredFile
-from depthba.dataset.reading import Dataset
+from depthba.dataset.reading import Dataset, is_dataset
 from depthba.dataset.sensor import PoseNoise, Sensor
 from depthba.dataset.verifying import verify
 from depthba.dataset.writing import DatasetWriter
@@ -16,5 +16,6 @@ __all__ = [
     "PoseNoise",
     "Sensor",
     "StoredFile",
+    "is_dataset",
     "verify",
 ]

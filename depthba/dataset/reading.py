@@ -14,7 +14,7 @@ from depthba.dataset.choosing import as_stored, crop, map_frame, masked, merge
 from depthba.dataset.cutting import Bounds, Roi
 from depthba.dataset.extras import read_calibration, read_markers
 from depthba.dataset.faults import Faults
-from depthba.dataset.header import read_header
+from depthba.dataset.header import FILE, read_header
 from depthba.dataset.listing import Entry, join, pose_file, read_entries, read_poses
 from depthba.dataset.model import Frame, Marker
 from depthba.dataset.saving import save
@@ -22,6 +22,11 @@ from depthba.dataset.sensor import PoseNoise, Sensor
 from depthba.errors import DatasetError, OptionError
 
 Array = NDArray[np.float64]
+
+
+def is_dataset(path: str | Path) -> bool:
+    """Tell whether a dataset was begun in a folder; whole or not."""
+    return (Path(path) / FILE).is_file()
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,6 +138,7 @@ def main() -> None:
         except Exception as error:  # whatever the library throws is for the parent to judge
             answer["error"] = " ".join(str(error).split())
         print(json.dumps(answer), file=answers, flush=True)
+    # Nobody is there to be told any more, whatever the library throws.
     with contextlib.suppress(Exception), _ended_after(_LEAVING):
         client.leave()
     # The library's destructors may wait for threads that never end.

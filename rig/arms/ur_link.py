@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import itertools
 import json
 import os
@@ -95,11 +96,10 @@ class Link:
         """Let the child brake and hang up, then end it; at once where it hangs."""
         with self._lock:
             if self._child.stdin is not None:
-                try:
+                # It hangs, or is gone already: it is ended in any case.
+                with contextlib.suppress(OSError, ValueError, subprocess.TimeoutExpired):
                     self._child.stdin.close()
                     self._child.wait(_PARTING)
-                except (OSError, ValueError, subprocess.TimeoutExpired):
-                    pass
             self._end()
 
     def _end(self) -> None:

@@ -13,13 +13,20 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rig.axes.axes import AxesState, Axis
-from rig.axes.grbl_words import Report, alarm_words, code_of, error_words, parse_report
-from rig.axes.limits import check_axes, check_speed, check_target
+from rig.axes.grbl_words import (
+    HOMING,
+    Report,
+    alarm_words,
+    code_of,
+    error_words,
+    homing_time,
+    parse_report,
+)
 from rig.axes.serial_link import SerialLink
-from rig.axes.watching import Patience, braked_on_failure, watch_move
+from rig.axes.watching import Patience, WatchedAxes
 from rig.errors import AxesError
 
 Array = NDArray[np.float64]
@@ -48,12 +55,13 @@ class GrblOptions:
     """For the greeting; a board that restarts when its port is opened needs two seconds."""
     reply_timeout: float = 1.0
     """For the answer to a line or a report, s."""
-    home_timeout: float = 60.0
-    """For `$H`. The controller says nothing meanwhile, so this is what ends it where it hangs."""
+    home_timeout: float | None = None
+    """For `$H`, s. The controller says nothing meanwhile, so this is what ends it where it hangs.
+    None: reckoned from the controller's travel ($130 to $132) and homing speeds ($24, $25)."""
     patience: Patience = field(default_factory=Patience)
 
 
-class GrblGantry:
+class GrblGantry(WatchedAxes):
     """`rig.axes.axes.Axes` on a GRBL 1.1 controller with homing ($22=1).
 
     The stamp of a state is the host's clock when its report arrived. Threads may share one; `stop`
@@ -61,7 +69,7 @@ class GrblGantry:
     """
 
     def __init__(self, options: GrblOptions):
-        check_axes(options.axes)
+        super().__init__(options.axes, options.patience, f"gantry {options.port}")
         names = [axis.name for axis in options.axes]
         if set(names) - set(_LETTERS):
             raise AxesError(f"axes {', '.join(names)}, expected some of x, y, z")
@@ -74,15 +82,10 @@ class GrblGantry:
         self._lock = threading.RLock()
         self._homed = False
         self._homing = False
+        self._home_timeout = HOMING
         self._held = False
         self._alarm: int | None = None
         self._offset: Array = np.zeros(3)
-        self._stops = 0
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Names and limits."""
-        return self._options.axes
 
     def connect(self) -> None:
         """Reset the controller, read its greeting and settings. It moves nothing.
@@ -95,6 +98,7 @@ class GrblGantry:
             try:
                 self._reset()
                 settings = self._settings()
+                self._home_timeout = self._options.home_timeout or homing_time(settings)
             except AxesError:
                 self.disconnect()
                 raise
@@ -118,9 +122,8 @@ class GrblGantry:
                 self._reset()
             self._homing = True
             try:
-                if self._stops != before:
-                    raise AxesError(f"{self._who}: stopped on request before homing")
-                self._line("$H", self._options.home_timeout)
+                self._refuse_stopped(before, "before homing")
+                self._line("$H", self._home_timeout)
             except BaseException as error:
                 self._end_motion()
                 if isinstance(error, AxesError) and self._stops != before:
@@ -152,50 +155,6 @@ class GrblGantry:
             alarm=alarm,
         )
 
-    def position(self) -> Array:
-        """(n,) m, now."""
-        return self.status().position
-
-    def move_to(self, target: ArrayLike, *, speed: float) -> AxesState:
-        """Go to a position (n,), m, along a straight line, at `speed` m/s."""
-        before = self._stops
-        position = check_target(self.axes, target)
-        check_speed(self.axes, speed)
-        with self._lock:
-            if self._held:
-                self._reset()
-            state = self.status()
-            if not self._homed:
-                why = f" ({alarm_words(self._alarm)})" if self._alarm is not None else ""
-                raise AxesError(
-                    f"{self._who}: the axes are not homed{why}, expected home() before a move"
-                )
-            if state.alarm is not None:
-                raise AxesError(f"{self._who}: {state.alarm}; see to it, then home the axes")
-        places = "".join(
-            f"{axis.name.upper()}{1e3 * value:.3f}"
-            for axis, value in zip(self.axes, position + self._origin, strict=True)
-        )
-        try:
-            with braked_on_failure(self.stop):
-                with self._lock:
-                    if self._stops != before:
-                        raise AxesError(f"{self._who}: stopped on request before the move began")
-                    # mm, absolute, per minute, in the machine's frame
-                    line = f"G21G90G94G53G1{places}F{60e3 * speed:.1f}"
-                    self._line(line, self._options.reply_timeout)
-                return watch_move(
-                    self.status,
-                    self.axes,
-                    position,
-                    self._options.patience,
-                    lambda: self._stops != before,
-                    self._who,
-                )
-        except AxesError:
-            self._end_motion()
-            raise
-
     def stop(self) -> None:
         """Brake now, and end the move that is under way in another thread. Never raises.
 
@@ -218,9 +177,21 @@ class GrblGantry:
             if link is not None:
                 link.close()
 
-    @property
-    def _who(self) -> str:
-        return f"gantry {self._options.port}"
+    def _awake(self) -> AxesState:
+        with self._lock:
+            if self._held:
+                self._reset()
+            return self.status()
+
+    def _start(self, position: Array, speed: float, before: int) -> None:
+        places = "".join(
+            f"{axis.name.upper()}{1e3 * value:.3f}"
+            for axis, value in zip(self.axes, position + self._origin, strict=True)
+        )
+        with self._lock:
+            self._refuse_stopped(before, "before the move began")
+            # mm, absolute, per minute, in the machine's frame
+            self._line(f"G21G90G94G53G1{places}F{60e3 * speed:.1f}", self._options.reply_timeout)
 
     def _open(self) -> SerialLink:
         if self._link is None:
@@ -282,8 +253,17 @@ class GrblGantry:
                 if self._note_alarm(line):
                     raise AxesError(f"{self._who}: alarm: {alarm_words(self._alarm)}")
                 said.append(line)
+            why = f"no answer to {text!r} within {timeout:.3g} s"
+            if self._homing:
+                with suppress(AxesError):  # the link is gone as well, and there is more to tell
+                    link.send(_RESET)
+                why = (
+                    f"homing says nothing for {timeout:.3g} s, longer than its travel and speed"
+                    " allow, and was stopped; expected the switches to be found: see to them and"
+                    " to the axes, or set home_timeout"
+                )
             self.disconnect()
-            raise AxesError(f"{self._who}: no answer to {text!r} within {timeout:g} s")
+            raise AxesError(f"{self._who}: {why}")
 
     def _report(self) -> Report:
         with self._lock:

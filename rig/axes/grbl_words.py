@@ -6,6 +6,7 @@ After the interface description of GRBL 1.1.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,3 +107,22 @@ def alarm_words(code: int | None) -> str:
 def error_words(code: int) -> str:
     """Return an error in words."""
     return f"{ERRORS.get(code, 'unknown error')} (error:{code})"
+
+
+HOMING = 60.0
+"""For homing where the settings do not say how long it may take, s."""
+
+
+def homing_time(settings: Mapping[str, str]) -> float:
+    """How long homing may take by a controller's settings, s; `HOMING` where they do not say.
+
+    GRBL looks for a switch over 1.5 times the travel and then gives up by itself (its limits.c);
+    the axes may go one after the other, and approach their switches a second time, slowly.
+    """
+    try:
+        travel = sum(abs(float(settings[f"$13{axis}"])) for axis in range(3))
+        slow, fast, pull_off = (float(settings[name]) for name in ("$24", "$25", "$27"))
+        seconds = 60.0 * (1.5 * travel / fast + 3.0 * 10.0 * pull_off / slow)
+    except (KeyError, ValueError, ZeroDivisionError):
+        return HOMING
+    return 1.2 * seconds + 3.0

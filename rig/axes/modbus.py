@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from depthba.errors import MissingPackage
 from rig.axes.axes import AxesState, Axis
-from rig.axes.limits import check_axes, check_speed, check_target
 from rig.axes.modbus_map import RegisterMap
-from rig.axes.watching import Patience, braked_on_failure, watch_move
+from rig.axes.watching import Patience, WatchedAxes, braked_on_failure
 from rig.errors import AxesError
 
 Array = NDArray[np.float64]
@@ -48,7 +47,7 @@ class ModbusOptions:
     patience: Patience = field(default_factory=Patience)
 
 
-class ModbusGantry:
+class ModbusGantry(WatchedAxes):
     """`rig.axes.axes.Axes` on a controller with the registers of `RegisterMap`.
 
     The stamp of a state is the host's clock when its answer arrived. Threads may share one: a
@@ -56,18 +55,12 @@ class ModbusGantry:
     """
 
     def __init__(self, options: ModbusOptions):
-        check_axes(options.axes)
+        super().__init__(options.axes, options.patience, f"gantry {options.host}:{options.port}")
         options.registers.check(len(options.axes))
         self._options = options
         self._client: Any = None
         self._sequence = 0
-        self._stops = 0
         self._lock = threading.RLock()
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Names and limits."""
-        return self._options.axes
 
     def connect(self) -> None:
         """Reach the controller, and see that it answers. AxesError in time whatever is there."""
@@ -101,8 +94,7 @@ class ModbusGantry:
             self._command(self._options.registers.commands.home, unless=before)
             while True:
                 state = self.status()
-                if self._stops != before:
-                    raise AxesError(f"{self._who}: stopped on request while homing")
+                self._refuse_stopped(before, "while homing")
                 if state.alarm is not None:
                     raise AxesError(f"{self._who}: alarm while homing: {state.alarm}")
                 if state.homed and not state.moving:
@@ -128,36 +120,6 @@ class ModbusGantry:
             alarm=map_.alarm_words(found[map_.alarm]) if alarm else None,
         )
 
-    def position(self) -> Array:
-        """(n,) m, now."""
-        return self.status().position
-
-    def move_to(self, target: ArrayLike, *, speed: float) -> AxesState:
-        """Go to a position (n,), m, along a straight line, at `speed` m/s."""
-        before = self._stops
-        position = check_target(self.axes, target)
-        check_speed(self.axes, speed)
-        state = self.status()
-        if state.alarm is not None:
-            raise AxesError(f"{self._who}: alarm: {state.alarm}; see to it, then home the axes")
-        if not state.homed:
-            raise AxesError(f"{self._who}: the axes are not homed, expected home() before a move")
-        map_ = self._options.registers
-        with braked_on_failure(self.stop):
-            operands = [(map_.speed, max(1, self._counts(speed)))]
-            operands += [
-                (at, self._counts(p)) for at, p in zip(map_.targets, position, strict=True)
-            ]
-            self._command(map_.commands.move, operands, unless=before)
-            return watch_move(
-                self.status,
-                self.axes,
-                position,
-                self._options.patience,
-                lambda: self._stops != before,
-                self._who,
-            )
-
     def stop(self) -> None:
         """Brake now, and end the move that is under way in another thread. Never raises."""
         self._stops += 1
@@ -171,9 +133,11 @@ class ModbusGantry:
             if client is not None:
                 client.close()
 
-    @property
-    def _who(self) -> str:
-        return f"gantry {self._options.host}:{self._options.port}"
+    def _start(self, position: Array, speed: float, before: int) -> None:
+        map_ = self._options.registers
+        operands = [(map_.speed, max(1, self._counts(speed)))]
+        operands += [(at, self._counts(p)) for at, p in zip(map_.targets, position, strict=True)]
+        self._command(map_.commands.move, operands, unless=before)
 
     def _connected(self) -> socket.socket:
         options = self._options
@@ -193,8 +157,8 @@ class ModbusGantry:
     ) -> None:
         """Send a command, unless a stop came since, and wait until the controller takes it."""
         with self._lock:  # a stop cannot come between the check and the command
-            if unless is not None and self._stops != unless:
-                raise AxesError(f"{self._who}: stopped on request before the move began")
+            if unless is not None:
+                self._refuse_stopped(unless, "before the move began")
             sequence = self._send(code, operands or [])
         deadline = time.monotonic() + self._options.reply_timeout
         while (taken := self._registers()[self._options.registers.acknowledged]) != sequence:

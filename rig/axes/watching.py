@@ -1,17 +1,18 @@
-"""Watches a move until the axes stand where they were sent, or says why they do not."""
+"""Moves under watch: checked before, followed until the axes stand, braked whatever goes wrong."""
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rig.axes.axes import AxesState, Axis
-from rig.axes.limits import described
+from rig.axes.limits import check_axes, check_speed, check_target, described
 from rig.errors import AxesError
 
 Array = NDArray[np.float64]
@@ -92,3 +93,76 @@ def braked_on_failure(stop: Callable[[], None]) -> Iterator[None]:
     except BaseException:
         stop()
         raise
+
+
+class WatchedAxes(ABC):
+    """What every gantry does alike, whatever its controller speaks; see `rig.axes.axes.Axes`."""
+
+    def __init__(self, axes: tuple[Axis, ...], patience: Patience, who: str):
+        """AxesError for axes that make no sense. `who` is for messages."""
+        check_axes(axes)
+        self._axes, self._patience, self._who = axes, patience, who
+        self._stops = 0
+        """How often `stop` was called: what began before a stop must not go on after it."""
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Names and limits."""
+        return self._axes
+
+    def position(self) -> Array:
+        """(n,) m, now."""
+        return self.status().position
+
+    def move_to(self, target: ArrayLike, *, speed: float) -> AxesState:
+        """Go to a position (n,), m, along a straight line, at `speed` m/s."""
+        before = self._stops
+        position = check_target(self._axes, target)
+        check_speed(self._axes, speed)
+        state = self._awake()
+        if not state.homed:
+            why = f" ({state.alarm})" if state.alarm is not None else ""
+            raise AxesError(
+                f"{self._who}: the axes are not homed{why}, expected home() before a move"
+            )
+        if state.alarm is not None:
+            raise AxesError(f"{self._who}: {state.alarm}; see to it, then home the axes")
+        try:
+            with braked_on_failure(self.stop):
+                self._start(position, speed, before)
+                return watch_move(
+                    self.status,
+                    self._axes,
+                    position,
+                    self._patience,
+                    lambda: self._stops != before,
+                    self._who,
+                )
+        except AxesError:
+            self._end_motion()
+            raise
+
+    def _refuse_stopped(self, before: int, when: str) -> None:
+        """AxesError if a stop came since `_stops` was `before`."""
+        if self._stops != before:
+            raise AxesError(f"{self._who}: stopped on request {when}")
+
+    @abstractmethod
+    def status(self) -> AxesState:
+        """The newest instant."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Brake now, and end the move that is under way in another thread. Never raises."""
+
+    @abstractmethod
+    def _start(self, position: Array, speed: float, before: int) -> None:
+        """Send a move to (n,), m, unless a stop came since `_stops` was `before`."""
+
+    def _awake(self) -> AxesState:
+        """The newest instant, after what an earlier stop has left was undone."""
+        return self.status()
+
+    def _end_motion(self) -> None:
+        """Do what must be done after a move that failed and was braked."""
+        return

@@ -6,7 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from depthba import se3
-from rig.session.options import Dome, Grid, Look, Steps
+from depthba.board_views import Views
+from depthba.boards import Board
+from depthba.camera import Camera
+from rig.session.poses import Calibration, Dome, Grid, Look, Steps
 
 Array = NDArray[np.float64]
 
@@ -70,6 +73,36 @@ def dome_poses(dome: Dome) -> Array:
     directions = np.concatenate(view)
     R = facing(directions, _swinging(dome.roll_deg, np.arange(len(directions))))
     return se3.make(R, np.array(dome.centre) - dome.radius * directions)
+
+
+def board_pose(aim: Calibration) -> Array:
+    """T_world_board (4, 4) of the board that a calibration looks at, as `depthba.boards` has it."""
+    z = -np.array(aim.facing) / np.linalg.norm(aim.facing)
+    # World x as it lies in the board; where the board faces along it, world y.
+    along = [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0]
+    x = along - (along @ z) * z
+    x /= np.linalg.norm(x)
+    # Turned about `facing`, which is -z.
+    R = np.column_stack([x, np.cross(z, x), z]) @ se3.exp_so3([0, 0, -np.radians(aim.turn_deg)])
+    middle = Board.parse(aim.board).corners().mean(axis=0)
+    return se3.make(R, np.array(aim.at) - R @ middle)
+
+
+def calibration_views(aim: Calibration, camera: Camera) -> list[Array]:
+    """Stacks (m, 4, 4) of alternative T_world_camera, the wanted first, for more views than asked.
+
+    OptionError where the camera never sees the whole board.
+    """
+    views = Views(
+        distance=aim.distance,
+        tilt=(float(np.radians(aim.tilt_deg[0])), float(np.radians(aim.tilt_deg[1]))),
+        roll=float(np.radians(aim.roll_deg)),
+        rim=aim.slack,
+    )
+    T_world_board = board_pose(aim)
+    rng = np.random.default_rng(aim.seed)
+    wanted = views.wanted(Board.parse(aim.board), camera, aim.count, rng)
+    return [np.asarray(T_world_board @ T_board_camera) for T_board_camera in wanted]
 
 
 def step_positions(steps: Steps) -> Array:

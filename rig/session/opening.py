@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from depthba.dataset import is_dataset
 from depthba.errors import DatasetError
 from rig.cameras.apart import CameraApart
 from rig.cameras.camera import CameraInfo
 from rig.session.carriers import Carrier, make_carrier
 from rig.session.options import Session, plain
 from rig.session.planning import Plan, plan
-from rig.session.record import holds_dataset, stored_plan
+from rig.session.record import stored_plan
 from rig.session.workspace import Workspace
 
 SPARE = 16_000_000
@@ -54,7 +55,7 @@ def opened(
     """
     carrier = make_carrier(session.rig, session.motion)
     space = Workspace.of(session, carrier.body)
-    begun = holds_dataset(out)
+    begun = is_dataset(out)
     taken_up = stored_plan(out, stored, space, rehearsed) if begun else None
     if not begun:
         _refuse_others(out)
@@ -79,7 +80,8 @@ def opened(
         if taken_up is None:
             # A gantry that does not know where it is will stand at 0 once it was homed.
             here = standing.joints if standing.known else np.zeros_like(standing.joints)
-            taken_up = plan(stored, space, here if space.rest is None else space.rest)
+            start = here if space.rest is None else space.rest
+            taken_up = plan(stored, space, start, lambda: opening.result().camera)
         info = opening.result()
         stack.callback(camera.close)
         _refuse_full_disk(out, info, len(taken_up.joints), session.colour)

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from depthba import se3
+from depthba.boards import Board
 from depthba.dataset import PoseNoise
 from depthba.errors import OptionError
 from rig.cameras.checking import FrameLimits
 from rig.session.marked import OPTIONS_OF
+from rig.session.poses import Matrix, Point, Poses
 
-Row = tuple[float, float, float, float]
-Matrix = Annotated[tuple[Row, Row, Row, Row], "a 4x4 (four rows of four numbers, m)"]
-Point = tuple[float, float, float]
-Pair = tuple[float, float]
 Box = tuple[float, float, float, float, float, float]
 
 IDENTITY: Matrix = (
@@ -90,149 +88,6 @@ class CameraChoice:
 
 
 @dataclass(frozen=True)
-class Look:
-    """A camera pose by where it stands and what it looks at.
-
-    The image's x lies as it does when the camera looks straight down and is then turned the
-    shortest way.
-    """
-
-    at: Point
-    """World, m."""
-    towards: Point
-    """World, m."""
-    roll_deg: float = 0.0
-    """About the view."""
-
-    def __post_init__(self) -> None:
-        """OptionError: it looks nowhere."""
-        if np.allclose(self.at, self.towards, atol=1e-6):
-            raise OptionError(f"at {self.at} and towards are one point, expected two")
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Gaze points in rows over an area of a plane, each seen from above."""
-
-    x: Pair
-    y: Pair
-    """First and last gaze point, world, m."""
-    counts: tuple[int, int]
-    """Along x and along y."""
-    distance: float | Pair
-    """From the gaze point to the camera, m; of two, every other frame has the other."""
-    z: float = 0.0
-    """Height of the gaze points, world, m."""
-    tilt_deg: float = 0.0
-    """By which the camera looks away from straight down; to another side from frame to frame."""
-    roll_deg: float = 0.0
-    """By which the image turns, to the one and the other side in turn."""
-    yaw_deg: float = 0.0
-    """By which all images are turned about the vertical."""
-
-    def __post_init__(self) -> None:
-        """OptionError names a value that makes no sense."""
-        if min(self.counts) < 1:
-            raise OptionError(f"counts {list(self.counts)}: expected 1 or more each")
-        if np.min(self.distance) <= 0.0:
-            raise OptionError(f"distance {self.distance}: expected above 0, m")
-        if not 0.0 <= self.tilt_deg < 90.0:
-            raise OptionError(f"tilt_deg {self.tilt_deg}: expected 0 to below 90")
-
-
-@dataclass(frozen=True)
-class Dome:
-    """Rings of cameras on a sphere around a point, all of which look at it."""
-
-    centre: Point
-    """World, m."""
-    radius: float
-    """m."""
-    tilts_deg: tuple[float, ...]
-    """Of each ring, from straight above."""
-    counts: tuple[int, ...]
-    """Cameras of each ring."""
-    first_deg: float = 0.0
-    """Azimuth of a ring's first camera, from world x."""
-    roll_deg: float = 0.0
-    """By which the image turns, to the one and the other side in turn."""
-
-    def __post_init__(self) -> None:
-        """OptionError names a value that makes no sense."""
-        if self.radius <= 0.0:
-            raise OptionError(f"radius {self.radius}: expected above 0, m")
-        if not self.counts or len(self.counts) != len(self.tilts_deg) or min(self.counts) < 1:
-            raise OptionError(
-                f"counts {list(self.counts)}: expected one of 1 or more for each of the"
-                f" {len(self.tilts_deg)} tilts_deg"
-            )
-        if min(self.tilts_deg) < 0.0 or max(self.tilts_deg) >= 180.0:
-            raise OptionError(f"tilts_deg {list(self.tilts_deg)}: expected 0 to below 180")
-
-
-@dataclass(frozen=True)
-class Taught:
-    """Poses that somebody drove to: a text file, a line of joints (rad) or positions (m) each."""
-
-    file: Path
-    """Numbers with blanks or commas between them; # begins a comment."""
-    degrees: bool = False
-    """The joints are in degrees."""
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Positions of a gantry, evenly between two corners."""
-
-    first: tuple[float, ...]
-    last: tuple[float, ...]
-    """m, an entry for each axis."""
-    counts: tuple[int, ...]
-    """Along each axis."""
-
-    def __post_init__(self) -> None:
-        """OptionError: the three do not belong together."""
-        if not len(self.first) == len(self.last) == len(self.counts):
-            raise OptionError(
-                "first, last and counts: expected an entry for each axis in all three"
-            )
-        if not self.counts or min(self.counts) < 1:
-            raise OptionError(f"counts {list(self.counts)}: expected 1 or more each")
-
-
-@dataclass(frozen=True)
-class Poses:
-    """One way to say poses; give exactly one."""
-
-    joints: tuple[tuple[float, ...], ...] | None = None
-    """Of an arm, rad."""
-    flange: tuple[Matrix, ...] | None = None
-    """T_base_flange of an arm."""
-    camera: tuple[Matrix | Look, ...] | None = None
-    """T_world_camera, for an arm."""
-    grid: Grid | None = None
-    dome: Dome | None = None
-    taught: Taught | None = None
-    positions: tuple[tuple[float, ...], ...] | None = None
-    """Of a gantry, m."""
-    steps: Steps | None = None
-
-    def __post_init__(self) -> None:
-        """OptionError: none is given, or two."""
-        given = [name for name in self.__dataclass_fields__ if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise OptionError(
-                f"{' and '.join(given) or 'nothing'} given, expected one of:"
-                f" {', '.join(self.__dataclass_fields__)}"
-            )
-
-    @property
-    def given(self) -> str:
-        """Which it is."""
-        return next(name for name in self.__dataclass_fields__ if getattr(self, name) is not None)
-
-
-@dataclass(frozen=True)
 class Motion:
     """How the rig goes from pose to pose."""
 
@@ -270,6 +125,8 @@ class Limits:
     lower: tuple[float, ...] | None = None
     upper: tuple[float, ...] | None = None
     """For the joints, rad, within the arm's own. None: those alone."""
+    arm_in_view: Literal["refuse", "allow"] = "refuse"
+    """Poses in which the arm stands in its own camera's view: it would move with the camera."""
 
     def __post_init__(self) -> None:
         """OptionError names a box that holds nothing."""
@@ -287,7 +144,7 @@ class Rehearsal:
     """What ``--rehearse`` puts in place of the hardware."""
 
     scene: str = "lab-1"
-    """As `depthba generate` takes it; around an arm."""
+    """As `depthba generate` takes it: around an arm as lab-1, under a gantry as industrial-4."""
     seed: int = 0
     """Of the scene and of the camera's noise."""
     sensor: str | None = None
@@ -297,7 +154,11 @@ class Rehearsal:
     joints: tuple[float, float, float, float, float, float] | None = None
     """Where the simulated arm stands at the start, rad. None: where it stands by itself."""
     joint_offset: float = 0.0
-    """Standard deviation of each joint's zero, rad, which nobody knows."""
+    """Standard deviation of each joint's zero, rad, or axis's, m, which nobody knows."""
+    mounting_t: float = 0.002
+    mounting_r_deg: float = 0.3
+    """Of a gantry: how far its camera sits from where `hand_eye` has it. An arm's sits where the
+    model of the arm has it."""
 
 
 @dataclass(frozen=True)
@@ -347,7 +208,7 @@ class Session:
             )
         arm = self.rig.kind == "ur"
         allowed = (
-            ("joints", "flange", "camera", "grid", "dome", "taught")
+            ("joints", "flange", "camera", "grid", "dome", "calibration", "taught")
             if arm
             else ("positions", "steps", "taught")
         )
@@ -357,8 +218,17 @@ class Session:
                     f"poses[{number}]: {poses.given} for a rig of kind {self.rig.kind},"
                     f" expected one of: {', '.join(allowed)}"
                 )
+        boards = {poses.calibration.board for poses in self.poses if poses.calibration is not None}
+        if len(boards) > 1:
+            raise OptionError(f"poses: boards {' and '.join(sorted(boards))}, expected one")
         if not arm and self.motion.move != "joints":
             raise OptionError("motion.move: linear is for arms, a gantry moves in lines anyway")
+
+    @property
+    def board(self) -> Board | None:
+        """The calibration board that it looks at; None: it does not calibrate."""
+        given = [poses.calibration.board for poses in self.poses if poses.calibration is not None]
+        return Board.parse(given[0]) if given else None
 
 
 def plain(value: Any) -> Any:

@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.camera import Camera
 from depthba.errors import OptionError, OutOfReach
 from depthba.postures import ROOM, SINGULAR, postures, turned_towards
-from rig.session.aims import dome_poses, grid_poses, look_pose, step_positions
-from rig.session.options import Look, Poses, Session
+from depthba.ur_outline import in_view
+from rig.session.aims import (
+    calibration_views,
+    dome_poses,
+    grid_poses,
+    look_pose,
+    step_positions,
+)
+from rig.session.options import Session
+from rig.session.poses import Calibration, Look, Poses
 from rig.session.reading import read_taught
 from rig.session.workspace import Workspace
 
 Array = NDArray[np.float64]
 
 _BATCH = 64
+_FEW = 4
+"""Alternatives to a view that are looked at together: mostly the first will do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +59,17 @@ class _Wish:
     T_base_flange: Array | None = None
 
 
-def plan(session: Session, space: Workspace, start: Array) -> Plan:
+def plan(
+    session: Session, space: Workspace, start: Array, see: Callable[[], Camera] | None = None
+) -> Plan:
     """Find joints for all poses, and an order in which the way is short.
 
     Args:
         session: what is asked for.
         space: where the rig may be.
         start: joints (n,) where the rig stands, or will stand, before the first.
+        see: gives the camera's intrinsics; called once what needs none of them is known to be
+            right. None: nobody looks whether the arm is in view; views of a board need it.
 
     Raises:
         OutOfReach: some poses cannot be taken, and the session does not leave them out; or none
@@ -62,11 +79,26 @@ def plan(session: Session, space: Workspace, start: Array) -> Plan:
     wishes = [
         replace(wish, label=f"{wish.label} of poses[{number}]") if len(session.poses) > 1 else wish
         for number, poses in enumerate(session.poses)
+        if poses.calibration is None
         for wish in _wishes(poses, space)
     ]
     choices, refused = _choices(wishes, space, start)
     if refused and session.unreachable == "refuse":
         raise OutOfReach(_listed(refused, len(wishes)))
+    if see is not None and space.body.arm is not None:
+        camera = see()
+        if session.limits.arm_in_view == "refuse":
+            refused += _out_of_view(wishes, choices, space, camera)
+        if refused and session.unreachable == "refuse":
+            raise OutOfReach(_listed(refused, len(wishes)))
+        for number, poses in enumerate(session.poses):
+            if poses.calibration is not None:
+                name = "calibration" + (f" of poses[{number}]" if len(session.poses) > 1 else "")
+                views = _views(poses.calibration, session, space, start, camera)
+                wishes += [_Wish(f"{name} {k}") for k in range(len(views))]
+                choices += views
+    elif session.board is not None:
+        raise OptionError("poses: calibration: expected a camera that is known")
     able = [k for k in range(len(wishes)) if len(choices[k])]
     order = _ordered(able, choices, space, start, session.order == "given")
     taken = {k for k, _ in order}
@@ -88,6 +120,78 @@ def plan(session: Session, space: Workspace, start: Array) -> Plan:
         tuple(refused),
         _length(joints, start),
     )
+
+
+def _out_of_view(
+    wishes: list[_Wish], choices: list[Array], space: Workspace, camera: Camera
+) -> list[tuple[str, str]]:
+    """Take from the choices those with the arm in view; the wishes that lose their last one."""
+    refused = []
+    for k, wish in enumerate(wishes):
+        parts = [_in_view(q, space, camera) for q in choices[k]]
+        left = [row for row, part in enumerate(parts) if part is None]
+        if parts and not left:
+            refused.append((wish.label, _seen(parts[0])))
+        choices[k] = choices[k][left]
+    return refused
+
+
+def _in_view(q: Array, space: Workspace, camera: Camera) -> str | None:
+    arm = space.body.arm
+    return None if arm is None else in_view(arm, q, space.T_flange_camera, camera)
+
+
+def _seen(part: str | None) -> str:
+    return (
+        f"the arm's {part} stands in the camera's view, expected a view free of it (or"
+        " limits.arm_in_view: allow)"
+    )
+
+
+def _views(
+    aim: Calibration, session: Session, space: Workspace, start: Array, camera: Camera
+) -> list[Array]:
+    """Joints (k, n) of as many views of the board as are asked for; OutOfReach: of how many."""
+    found: list[Array] = []
+    reasons: Counter[str] = Counter()
+    for T_world_camera in calibration_views(aim, camera):
+        T = se3.inverse(space.T_world_base) @ T_world_camera @ se3.inverse(space.T_flange_camera)
+        for first in range(0, len(T), _FEW):
+            q, why = _first(T[first : first + _FEW], session, space, start, camera)
+            if len(q):
+                found.append(q)
+                break
+            reasons[why] += 1
+        if len(found) == aim.count:
+            return found
+    most = "; ".join(f"{count} x {why}" for why, count in reasons.most_common(3))
+    raise OutOfReach(
+        f"{len(found)} of {aim.count} views of the board can be taken, expected all: move the"
+        f" board to where the arm sees it from all sides, or widen the limits: {most}"
+    )
+
+
+def _first(
+    T_base_flange: Array, session: Session, space: Workspace, start: Array, camera: Camera
+) -> tuple[Array, str]:
+    """Joints (k, n) of the first of some flanges (m, 4, 4) that can be had; else why not."""
+    arm = space.body.arm
+    assert arm is not None
+    q, right = postures(arm, T_base_flange, start)
+    why = ""
+    for k in range(len(T_base_flange)):
+        able, reason = _judged(q[k], right[k], space, start)
+        why = why or (reason or "").partition(",")[0]
+        if session.limits.arm_in_view == "refuse":
+            free = [one for one in able if _in_view(one, space, camera) is None]
+            why = why or ("the arm in view" if len(able) and not free else "")
+            able = np.array(free).reshape(-1, q.shape[-1])
+        # Where no way leads there from the start none may lead there at all.
+        able = np.array([one for one in able if space.way(start, one)[1] is None])
+        if len(able):
+            return able, ""
+        why = why or "no way there"
+    return np.empty((0, q.shape[-1])), why
 
 
 def _wishes(poses: Poses, space: Workspace) -> list[_Wish]:
@@ -255,7 +359,10 @@ def _length(joints: Array, start: Array) -> float:
 
 
 def _listed(refused: list[tuple[str, str]], count: int) -> str:
-    each = "; ".join(f"{label}: {reason}" for label, reason in refused)
+    alike: dict[str, list[str]] = {}
+    for label, reason in refused:
+        alike.setdefault(reason, []).append(label)
+    each = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in alike.items())
     return (
         f"{len(refused)} of {count} poses cannot be taken, expected all of them"
         f" (or unreachable: leave out): {each}"

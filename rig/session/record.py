@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import __version__, durable
-from depthba.camera import Camera
 from depthba.dataset import Dataset, DatasetWriter
+from depthba.dataset.extras import CALIBRATION
 from depthba.dataset.faults import Faults
 from depthba.dataset.header import read_header
 from depthba.documents import parse_json
@@ -109,12 +109,15 @@ def begin(
     }
     if session.pose_noise is not None:
         header["pose_noise"] = plain(session.pose_noise)
-    return DatasetWriter.create(path, header)
+    writer = DatasetWriter.create(path, header)
+    write_board(writer, session)
+    return writer
 
 
-def holds_dataset(path: Path) -> bool:
-    """Whether a dataset was begun in a folder."""
-    return (path / "dataset.json").is_file()
+def write_board(writer: DatasetWriter, session: Session) -> None:
+    """Write calibration.json where the session looks at a board and there is none yet."""
+    if session.board is not None and not (writer.path / CALIBRATION).exists():
+        writer.write_calibration({"board": session.board.json()})
 
 
 def stored_plan(path: Path, session: Session, space: Workspace, rehearsed: bool) -> Plan:
@@ -213,17 +216,10 @@ def _finish_line(file: Path) -> None:
 
 
 def _sensor(info: CameraInfo) -> dict[str, Any]:
-    camera: Camera = info.camera
     sensor: dict[str, Any] = {
         "kind": "depth",
         "model": info.model,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
+        **info.camera.json(),
         "depth_scale": info.depth_scale,
     }
     for name in ("depth_min", "depth_max"):

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -21,6 +17,7 @@ from rig.cameras.camera import CameraInfo, Capture, DepthCamera
 from rig.cameras.checking import check
 from rig.errors import CameraError, CameraTimeout, RigError, Stopped
 from rig.session.carriers import Carrier, Standing, await_still
+from rig.session.interrupts import Interrupts
 from rig.session.options import Session
 from rig.session.planning import Plan
 from rig.session.record import Skipped, note_skipped, progress
@@ -90,6 +87,8 @@ class Run:
     listeners: Listeners = field(default_factory=Listeners)
     again: bool = False
     """Try the stations that an earlier run skipped once more, at the end."""
+    interrupts: Interrupts = field(default_factory=Interrupts)
+    """Who hears Ctrl-C."""
     _before: Capture | None = None
     _retries: int = 0
     _stops: int = 0
@@ -101,6 +100,10 @@ class Run:
             SessionEnded: what ended it, and that the same command goes on.
             KeyboardInterrupt: by the user; the rig is braked, the dataset whole.
         """
+        with self.interrupts.heard():
+            return self._all()
+
+    def _all(self) -> Summary:
         begin, path = time.monotonic(), self.writer.path
         so_far = progress(path)
         given_up = {entry.station: entry for entry in so_far.skipped}
@@ -123,6 +126,7 @@ class Run:
                         f"{in_a_row} poses in a row without a frame, the last because: {reason};"
                         " expected a camera that delivers"
                     )
+            self.interrupts.check()
         except (DepthbaError, OSError) as error:
             self.carrier.stop()
             raise SessionEnded(self._farewell(str(error))) from error
@@ -185,6 +189,7 @@ class Run:
                         f" {reason}; expected it to stand within the limits: move it there by hand"
                     )
                 for leg in legs:
+                    self.interrupts.check()
                     self.carrier.move(leg)
                 time.sleep(self.session.motion.settle)
                 return
@@ -217,6 +222,7 @@ class Run:
                     f"{self.carrier.who}: stands {away:.3g} {self.space.body.unit} from"
                     f" {self.plan.labels[k]}, expected at most {10.0 * session.motion.still:g}"
                 )
+            self.interrupts.check()
             since = time.time()
             capture = self.camera.capture(session.camera.timeout)
             now = time.time()
@@ -257,7 +263,7 @@ class Run:
             "label": self.plan.labels[k],
             "rig_stamp": standing.stamp,
         }
-        with held_interrupt():
+        with self.interrupts.held():
             frame = self.writer.add_frame(
                 stamp=capture.stamp,
                 T_world_camera=T_world_camera,
@@ -270,25 +276,3 @@ class Run:
             )
             self.listeners.committed(frame)
         self._say(f"{self.plan.labels[k]} taken")
-
-
-@contextlib.contextmanager
-def held_interrupt() -> Iterator[None]:
-    """Let Ctrl-C wait until the block has ended; does nothing in threads that are not the main."""
-    caught: list[int] = []
-
-    def later(number: int, frame: FrameType | None) -> None:
-        caught.append(number)
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = [signal.signal(number, later) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-    if caught:
-        raise KeyboardInterrupt

@@ -33,8 +33,8 @@ class Arguments:
     it did not settle.
     """
 
-    dataset: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of the dataset; its frames need flange poses."""
+    dataset: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")] = None
+    """Folder of the dataset; its frames need flange poses. Needed but for --print-board."""
     board: str | None = None
     """Inner corners along x and y and the side of a square, m: 10x7x0.03, charuco:10x7x0.03. None:
     as calibration.json says."""
@@ -49,6 +49,12 @@ class Arguments:
     """Write poses_arm.txt, the camera poses by the arm, into the dataset."""
     from_: Annotated[Path | None, tyro.conf.arg(name="from", metavar="FILE")] = None
     """With --apply: take this hand_eye.json and calibrate nothing."""
+    print_board: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Calibrate nothing: draw the board of --board, to be printed in its true size, into a .pdf or
+    .png."""
+    page: str = "A4"
+    """With --print-board: the sheet, A0 to A5, letter, legal or tabloid, or its width and height in
+    mm, as 400x300."""
     out: Path | None = None
     """Folder for the run, new or empty. None: logs/<name>-<yyyymmdd-hhmmss>."""
     overwrite: bool = False
@@ -77,6 +83,10 @@ def run(arguments: Arguments) -> int:
     from depthba.verbs.register import removed_on_failure
     from rig.hand_eye.record import read_record, write_content
 
+    if arguments.print_board is not None:
+        return _print_board(arguments, arguments.print_board)
+    if arguments.dataset is None:
+        raise OptionError("no dataset, expected the folder of one (or --print-board FILE)")
     if arguments.from_ is not None and not arguments.apply:
         raise OptionError(f"--from {arguments.from_}: expected --apply beside it")
     if arguments.from_depth and arguments.board is not None:
@@ -106,6 +116,24 @@ def run(arguments: Arguments) -> int:
     else:
         print("\n".join(found.lines))
     return DONE if found.record.trusted else NOT_TO_BE_TRUSTED
+
+
+def _print_board(arguments: Arguments, path: Path) -> int:
+    from depthba.board_print import layout, write
+    from depthba.boards import Board
+
+    if arguments.board is None:
+        raise OptionError(f"--print-board {path}: expected --board beside it, as 10x7x0.03")
+    if arguments.dataset is not None:
+        raise OptionError(f"--print-board {path}: expected no dataset beside it")
+    sheet = layout(Board.parse(arguments.board), arguments.page)
+    write(sheet, path, overwrite=arguments.overwrite)
+    if arguments.json:
+        width, height = sheet.page
+        print_json({"file": str(path), "page_mm": [width, height], "board": sheet.board.json()})
+    else:
+        print(f"{path}: print it at 100 %, not fitted to the page; measure the bar of 100 mm")
+    return DONE
 
 
 def _from_depth(

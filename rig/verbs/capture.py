@@ -5,14 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -23,6 +20,7 @@ from depthba.verbs.output import note, print_json
 from depthba.verbs.progress import Bar
 
 if TYPE_CHECKING:
+    from rig.session.interrupts import Interrupts
     from rig.session.opening import Opened
     from rig.session.options import Session
     from rig.session.running import Listeners, Summary
@@ -61,15 +59,14 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Check, capture, say how it went; return the exit status."""
-    # started in the background of a script it would be deaf to Ctrl-C, which brakes the rig
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    from rig.session.interrupts import Interrupts
     from rig.session.opening import opened
     from rig.session.reading import read_session
 
     session = _chosen(read_session(arguments.session), arguments)
+    interrupts = Interrupts()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_terminated_as_interrupted())
+        stack.enter_context(interrupts.heard())
         viewer = stack.enter_context(_viewer(arguments))
         bar = stack.enter_context(Bar(arguments.out.name, "checking"))
         bar.show("checking", 0, None)
@@ -89,13 +86,14 @@ def run(arguments: Arguments) -> int:
             note(f"warning: {label} is left out: {reason}")
         if arguments.dry_run:
             return _tell_plan(arguments, ready)
-        summary = _capture(arguments, session, running, ready, bar, viewer)
+        summary = _capture(arguments, session, running, ready, bar, viewer, interrupts)
     if arguments.json:
         print_json(_as_json(summary))
     else:
         print("\n".join(_text(summary)))
     if viewer is not None:
-        viewer.stay()
+        with interrupts.heard():
+            viewer.stay()
     return DONE if summary.complete else NOT_TO_BE_TRUSTED
 
 
@@ -131,6 +129,7 @@ def _capture(
     ready: Opened,
     bar: Bar,
     viewer: Any,
+    interrupts: Interrupts,
 ) -> Summary:
     from rig.session import record
     from rig.session.running import Run
@@ -138,6 +137,7 @@ def _capture(
     path = arguments.out
     if ready.begun:
         writer = record.resume(path, ready.info)
+        record.write_board(writer, session)
         for warning in writer.warnings:
             note(f"warning: {warning}")
     else:
@@ -155,6 +155,7 @@ def _capture(
             writer,
             listeners,
             arguments.retry_skipped,
+            interrupts,
         )
         try:
             return capture()
@@ -220,24 +221,6 @@ def _viewer(arguments: Arguments) -> Iterator[Any]:
         return
     with _live().opened(arguments.web) as viewer:
         yield viewer
-
-
-@contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """What asks this process to end, ends it as Ctrl-C does: the rig is braked first."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        before = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not the main thread: nobody can be asked there
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _tell_plan(arguments: Arguments, ready: Opened) -> int:

@@ -111,6 +111,16 @@ class Carriage:
         step = self.mechanics.resolution
         return np.asarray(np.rint((self.true_place(now) - self._zero) / step) * step)
 
+    def glimpse(self, now: float) -> Array:
+        """As `position`, for another thread: it looks, and lets nothing happen."""
+        legs, place, until = list(self._legs), self._place, min(now, self._fails_at)
+        for leg in legs:
+            place = leg.at(until)[0]
+            if until < leg.began + leg.profile.duration:
+                break
+        step = self.mechanics.resolution
+        return np.asarray(np.rint((place - self._zero) / step) * step)
+
     def doing(self, now: float) -> Doing:
         """What the axes are at. A stalled move goes on for ever."""
         self._advance(now)

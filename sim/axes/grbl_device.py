@@ -22,7 +22,8 @@ import numpy as np
 
 from depthba.errors import OptionError
 from sim.axes.carriage import Carriage, Doing, Mechanics
-from sim.axes.serving import end_abruptly
+from sim.axes.serving import end_abruptly, end_with_parent
+from sim.axes.stage import Stage, tell
 
 _BANNER = "\r\nGrbl 1.1h ['$' for help]\r\n"
 _UNLOCK = "[MSG:'$H'|'$X' to unlock]\r\n"
@@ -43,9 +44,15 @@ class Options:
     """Whether homing is enabled ($22)."""
     banner: bool = True
     """Off: it never greets, as another device at that port."""
+    mute_homing: bool = False
+    """It begins to home, and is never heard of again until it is reset."""
     rate: float = 1.0
     """How many times faster than real its time runs."""
     mechanics: Mechanics = field(default_factory=Mechanics)
+    stage: Stage = field(default_factory=Stage)
+    """What stands around it."""
+    end_with_parent: bool = False
+    """End as soon as the process that started it is gone."""
 
 
 class GrblDevice:
@@ -99,7 +106,7 @@ class GrblDevice:
         if self.carriage.alarm == "limit":
             self.carriage.alarm = None
             self._halt(1)
-        if self._homing and doing is not Doing.HOMING:
+        if self._homing and doing is not Doing.HOMING and not self.options.mute_homing:
             self._homing = False
             if self.carriage.alarm == "switch":
                 self.carriage.alarm = None
@@ -152,12 +159,17 @@ class GrblDevice:
 
     def _obey(self, line: str, now: float) -> str:
         if line == "$$":
-            settings = {
+            settings: dict[str, float] = {
                 "$10": int(self.options.report == "machine"),
                 "$13": 0,
                 "$20": 1,
                 "$22": int(self.options.homing),
+                "$24": round(60e3 * self.options.mechanics.creep_speed, 3),
+                "$25": round(60e3 * self.options.mechanics.homing_speed, 3),
+                "$27": round(1e3 * self.options.mechanics.pull_off, 3),
             }
+            settings |= {f"$13{k}": 0.0 for k in range(3)}
+            settings |= {f"$13{k}": round(mm, 3) for k, mm in enumerate(self._travel)}
             return "".join(f"{name}={value}\r\n" for name, value in settings.items()) + "ok\r\n"
         if line == "$H":
             if not self.options.homing:
@@ -211,6 +223,9 @@ def serve(options: Options) -> None:
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     device = GrblDevice(options)
+    tell(options.stage, lambda: device.carriage.glimpse(options.rate * time.monotonic()))
+    if options.end_with_parent:
+        end_with_parent()
     print(f"listening on {os.ttyname(theirs)}", flush=True)
     if options.banner:
         os.write(ours, device.greet())

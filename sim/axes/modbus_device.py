@@ -24,7 +24,8 @@ import numpy as np
 
 from depthba.errors import MissingPackage, OptionError
 from sim.axes.carriage import Carriage, Doing, Mechanics
-from sim.axes.serving import check_loopback, end_abruptly
+from sim.axes.serving import check_loopback, end_abruptly, end_with_parent
+from sim.axes.stage import Stage, tell
 
 METRES_PER_COUNT = 1e-6
 HOME, MOVE, STOP, RESET = 1, 2, 3, 4
@@ -48,6 +49,10 @@ class Options:
     rate: float = 1.0
     """How many times faster than real its time runs."""
     mechanics: Mechanics = field(default_factory=Mechanics)
+    stage: Stage = field(default_factory=Stage)
+    """What stands around it."""
+    end_with_parent: bool = False
+    """End as soon as the process that started it is gone."""
 
 
 class ModbusDevice:
@@ -132,6 +137,9 @@ async def serve(options: Options) -> None:
         ) from error
     check_loopback(options.host)
     device = ModbusDevice(options)
+    tell(options.stage, lambda: device.carriage.glimpse(options.rate * time.monotonic()))
+    if options.end_with_parent:
+        end_with_parent()
 
     async def action(
         function: int, start: int, address: int, count: int, registers: list, values: list | None

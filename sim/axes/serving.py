@@ -5,12 +5,17 @@ from __future__ import annotations
 import ipaddress
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable
 from typing import TypeVar
 
 from depthba.errors import DepthbaError, OptionError
 
 Options = TypeVar("Options")
+
+_LOOK = 0.5
+"""Between two looks whether the parent is still there, s."""
 
 
 def check_loopback(host: str) -> None:
@@ -28,6 +33,18 @@ def check_loopback(host: str) -> None:
 def end_abruptly() -> None:
     """End this process as a power cut would: nothing is said to the client, nothing cleaned up."""
     os._exit(1)
+
+
+def end_with_parent() -> None:
+    """End this process as soon as the one that started it is gone."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        end_abruptly()
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def run(kind: type[Options], serve: Callable[[Options], None]) -> None:

@@ -1,4 +1,4 @@
-"""A depth camera on the simulated arm: renders what it sees from where the arm truly is.
+"""A depth camera on the simulated arm or gantry: renders what it sees from where that truly is.
 
 It is a camera to whoever has an interface like this: `open`, `capture`, `close`. The scene and the
 arm's place it learns from the running controller's control channel, so that it needs no more than
@@ -153,7 +153,9 @@ class SimulatedCamera:
         if self._size is not None:
             sensor = sensor.resized(*map(int, self._size))
         world, stages = World.build(entry, about["seed"]), choose_stages(self._clean)
-        joints = joint_addresses(world.model, tuple(about["joint_names"]))
+        names = tuple(about["joint_names"])
+        # A gantry has none in the scene: it is not seen.
+        joints = joint_addresses(world.model, names) if names else np.zeros(0, np.int64)
         self._studio, self._last = _Studio(world, sensor, stages, joints), None
         # What is compiled or built for a first frame must not take that frame's time.
         small = replace(self._studio, sensor=sensor.resized(*_SMALL))
@@ -181,7 +183,8 @@ class SimulatedCamera:
         stamp = 0.5 * (asked + time.time())
         joints = np.array(truth["joints"], float)
         T_true = np.array(truth["T_world_flange"], float) @ self.T_flange_camera_true
-        depth, image = studio.expose(joints, T_true, self._seed, self._label(joints), self._rgb)
+        label = self._label(joints if len(joints) else T_true[:3, 3])
+        depth, image = studio.expose(joints, T_true, self._seed, label, self._rgb)
         return SimulatedCapture(depth.astype(np.float32), stamp, image, T_true, joints)
 
     def close(self) -> None:
@@ -190,7 +193,7 @@ class SimulatedCamera:
         self._studio = None
 
     def _label(self, joints: Array) -> int:
-        """What the noise of a frame at these joints (n,) is drawn by."""
+        """What the noise of a frame at these joints, or that place, (n,) is drawn by."""
         pose = zlib.crc32(np.round(1e5 * joints).astype(np.int64).tobytes())
         before = self._last
         count = before[1] + 1 if before is not None and before[0] == pose else 0

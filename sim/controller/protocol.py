@@ -129,10 +129,10 @@ class Recipe:
             value = values.get(name)
             if value is None:
                 flat.extend([0] * count)
-            elif count == 1:
-                flat.append(value)  # type: ignore[arg-type]
+            elif isinstance(value, int | float):
+                flat.append(value)
             else:
-                flat.extend(value)  # type: ignore[arg-type]
+                flat.extend(value)
         return self.layout.pack(*flat)
 
     def unpack(self, content: bytes) -> dict[str, float]:

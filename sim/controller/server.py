@@ -82,6 +82,7 @@ class Server:
         self._refuse()
         for client in list(self._clients):
             self._hang_up(client)
+        # Closed already, where a port was taken and the server never began.
         with contextlib.suppress(KeyError, ValueError):
             self._selector.unregister(self._control)
         self._control.close()

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from depthba import se3
 from depthba.kinematics import UR16E, DhArm
+from depthba.ur_outline import FORE, HULLS, UPPER
 from sim.engine import mujoco
 
 Array = NDArray[np.float64]
@@ -76,8 +77,6 @@ _FINISHES = {
 
 _A2, _A3 = UR16E.a[1], UR16E.a[2]
 _D1, _D4, _D5, _D6 = UR16E.d[0], UR16E.d[3], UR16E.d[4], UR16E.d[5]
-_UPPER, _FORE = 0.176, 0.039
-"""How far the tubes lie from the frames that the parameters put in the shoulder's plane, m."""
 _SHOULDER_LINK, _UPPER_ARM, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3 = LINKS
 
 _SHAPES = (
@@ -91,17 +90,17 @@ _SHAPES = (
     _Shape(_SHOULDER_LINK, (0, -0.092, _D1), (0, -0.099, _D1), 0.073, "joint"),
     _Shape(_UPPER_ARM, (0, 0, 0.099), (0, 0, 0.246), 0.076),
     _Shape(_UPPER_ARM, (0, 0, 0.246), (0, 0, 0.258), 0.069, "cap"),
-    _Shape(_UPPER_ARM, (-0.06, 0, _UPPER), (_A2 + 0.05, 0, _UPPER), 0.057),
-    _Shape(_UPPER_ARM, (-0.074, 0, _UPPER), (-0.090, 0, _UPPER), 0.0585, "joint"),
-    _Shape(_UPPER_ARM, (_A2 + 0.080, 0, _UPPER), (_A2 + 0.064, 0, _UPPER), 0.0585, "joint"),
+    _Shape(_UPPER_ARM, (-0.06, 0, UPPER), (_A2 + 0.05, 0, UPPER), 0.057),
+    _Shape(_UPPER_ARM, (-0.074, 0, UPPER), (-0.090, 0, UPPER), 0.0585, "joint"),
+    _Shape(_UPPER_ARM, (_A2 + 0.080, 0, UPPER), (_A2 + 0.064, 0, UPPER), 0.0585, "joint"),
     _Shape(_UPPER_ARM, (_A2, 0, 0.108), (_A2, 0, 0.234), 0.063),
     _Shape(_UPPER_ARM, (_A2, 0, 0.234), (_A2, 0, 0.245), 0.057, "cap"),
     _Shape(_FOREARM, (0, 0, 0.108), (0, 0, 0.101), 0.060, "joint"),
     _Shape(_FOREARM, (0, 0, 0.101), (0, 0, -0.020), 0.062),
     _Shape(_FOREARM, (0, 0, -0.020), (0, 0, -0.031), 0.056, "cap"),
-    _Shape(_FOREARM, (-0.05, 0, _FORE), (_A3 + 0.03, 0, _FORE), 0.046),
-    _Shape(_FOREARM, (-0.060, 0, _FORE), (-0.074, 0, _FORE), 0.0475, "joint"),
-    _Shape(_FOREARM, (_A3 + 0.060, 0, _FORE), (_A3 + 0.046, 0, _FORE), 0.0475, "joint"),
+    _Shape(_FOREARM, (-0.05, 0, FORE), (_A3 + 0.03, 0, FORE), 0.046),
+    _Shape(_FOREARM, (-0.060, 0, FORE), (-0.074, 0, FORE), 0.0475, "joint"),
+    _Shape(_FOREARM, (_A3 + 0.060, 0, FORE), (_A3 + 0.046, 0, FORE), 0.0475, "joint"),
     _Shape(_FOREARM, (_A3, 0, -0.010), (_A3, 0, 0.092), 0.046),
     _Shape(_FOREARM, (_A3, 0, -0.010), (_A3, 0, -0.019), 0.041, "cap"),
     _Shape(_WRIST_1, (0, 0, 0.092), (0, 0, 0.099), 0.044, "joint"),
@@ -120,21 +119,7 @@ _BAR = (0.175, 0.030, 0.033)
 """Width, height and depth of the ZED 2's bar, m (data sheet); its eyes lie 120 mm apart."""
 
 _HULLS = (
-    _Shape(BASE, (0, 0, 0.0), (0, 0, 0.06), 0.097),
-    _Shape(_SHOULDER_LINK, (0, 0, 0.125), (0, 0, _D1), 0.085),
-    _Shape(_SHOULDER_LINK, (0, 0.045, _D1), (0, -0.055, _D1), 0.090),
-    _Shape(_UPPER_ARM, (0, 0, 0.155), (0, 0, 0.200), 0.095),
-    _Shape(_UPPER_ARM, (0, 0, _UPPER), (_A2, 0, _UPPER), 0.066),
-    _Shape(_UPPER_ARM, (_A2, 0, 0.150), (_A2, 0, 0.200), 0.076),
-    _Shape(_FOREARM, (0, 0, 0.060), (0, 0, 0.015), 0.077),
-    _Shape(_FOREARM, (0, 0, _FORE), (_A3, 0, _FORE), 0.054),
-    _Shape(_FOREARM, (_A3, 0, 0.022), (_A3, 0, 0.055), 0.060),
-    _Shape(_WRIST_1, (0, 0, 0.130), (0, 0, 0.190), 0.060),
-    _Shape(_WRIST_1, (0, 0, _D4), (0, -0.020, _D4), 0.063),
-    _Shape(_WRIST_2, (0, 0, 0.105), (0, 0, 0.135), 0.060),
-    _Shape(_WRIST_2, (0, 0, _D5), (0, 0.025, _D5), 0.064),
-    _Shape(_WRIST_3, (0, 0, 0.080), (0, 0, 0.088), 0.048),
-    _Shape(_WRIST_3, (0, 0, _D6 + 0.004), (0.029, -0.0503, _D6 + 0.004), 0.047),
+    *(_Shape((BASE, *LINKS)[hull.link], hull.start, hull.end, hull.radius) for hull in HULLS),
     _Shape(CAMERA, (-0.0125, 0, -0.0185), (0.1325, 0, -0.0185), 0.028),
 )
 """Capsules around the shapes, for collisions: every shape's rim lies inside one."""
@@ -150,8 +135,8 @@ add. MuJoCo leaves out neighbours by itself, but not those of a body that stands
 
 _MASSES = (
     _Mass(7.369, (0, 0, 0.16), 2, 0.2, 0.08),
-    _Mass(10.45, (0.5 * _A2, 0, _UPPER), 0, 0.55, 0.065),
-    _Mass(4.321, (0.5 * _A3, 0, _FORE), 0, 0.42, 0.05),
+    _Mass(10.45, (0.5 * _A2, 0, UPPER), 0, 0.55, 0.065),
+    _Mass(4.321, (0.5 * _A3, 0, FORE), 0, 0.42, 0.05),
     _Mass(2.18, (0, 0, 0.15), 2, 0.13, 0.046),
     _Mass(2.033, (0, 0, 0.11), 2, 0.12, 0.046),
     _Mass(0.907, (0, 0, 0.09), 2, 0.05, 0.04),

@@ -15,14 +15,16 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from depthba import se3
 from rig.hand_eye.board import opencv, park_martin
-from rig.hand_eye.board.calibration import BoardOptions, calibrate
+from rig.hand_eye.board.calibration import BoardOptions, Intrinsics, calibrate
 from tests.rig.board_problems import COLUMNS, X, error, problem
 
 TRIALS = 40
+CAMERAS: tuple[Intrinsics, ...] = ("fixed", "prior")
 LIMITS = {"exact": (0.040, 0.23), "K off": (0.05, 0.25), "robot x 10": (0.07, 0.62)}
-"""Median, degrees and mm; where K is exact it is taken as exact, else believed to 0.1 %."""
+"""Median, degrees and mm, by default; but for the rotation of the last: there K is taken as exact,
+and by default it is 0.0703."""
 TAIL = (0.09, 0.40)
-"""95th percentile of the exact column."""
+"""95th percentile of the exact column, by default."""
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -34,8 +36,8 @@ def test_study(benchmark: BenchmarkFixture, column: str) -> None:
     def run() -> None:
         for seed in range(TRIALS):
             o = problem(COLUMNS[column], seed)
-            for intrinsics in ("fixed", "prior"):
-                result = calibrate(o, BoardOptions(intrinsics=intrinsics))  # type: ignore[arg-type]
+            for intrinsics in CAMERAS:
+                result = calibrate(o, BoardOptions(intrinsics=intrinsics))
                 if result.T is None or result.covariance is None:
                     assert (column, intrinsics) == ("K off", "fixed")  # a wrong K held for right
                     continue
@@ -60,10 +62,12 @@ def test_study(benchmark: BenchmarkFixture, column: str) -> None:
             assert (ours < np.median(rows[f"opencv {method.lower()}"], axis=0)).all(), method
         # 240 degrees of freedom, poses and noises of the study's own: roughly honest
         assert 0.7 < squares[name] / (6 * TRIALS) < 1.4
-    best = rows["prior" if column == "K off" else "fixed"]
-    assert (np.median(best, axis=0) <= LIMITS[column]).all()
+    default = np.median(rows["prior"], axis=0)
+    assert default[1] <= LIMITS[column][1]
+    best = np.median(rows["fixed"], axis=0) if column == "robot x 10" else default
+    assert (best <= LIMITS[column]).all()
     if column == "exact":
-        assert (np.quantile(best, 0.95, axis=0) <= TAIL).all()
+        assert (np.quantile(rows["prior"], 0.95, axis=0) <= TAIL).all()
 
 
 def test_algebraic_solver_on_kinhec(benchmark: BenchmarkFixture, tmp_path: Path) -> None:

@@ -12,6 +12,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
+
+from rig.errors import RigError
+
 ROOT = Path(__file__).parents[2]
 LONGEST = 5.0
 """By when a fault has to have ended, s: the issue's bound."""
@@ -73,3 +77,10 @@ def ends_in_time() -> Iterator[None]:
     began = time.monotonic()
     yield
     assert time.monotonic() - began < LONGEST
+
+
+def one_line(error: pytest.ExceptionInfo[RigError]) -> str:
+    """The message, which is one line and says what was expected."""
+    text = str(error.value)
+    assert "\n" not in text and "expected" in text
+    return text

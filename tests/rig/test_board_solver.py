@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ from depthba import se3
 from depthba.camera import Camera
 from rig.hand_eye.board import chain as ch
 from rig.hand_eye.board import opencv, park_martin
-from rig.hand_eye.board.calibration import BoardHandEye, BoardOptions, calibrate
+from rig.hand_eye.board.calibration import BoardHandEye, BoardOptions, Intrinsics, calibrate
 from rig.hand_eye.board.detection import velocities
-from rig.hand_eye.board.observations import Observations
+from rig.hand_eye.board.observations import Mount, Observations
 from rig.hand_eye.board.pnp import board_poses
 from tests.rig.board_problems import (
     CAMERA,
@@ -32,13 +33,14 @@ from tests.rig.board_problems import (
 )
 
 Floats = NDArray[np.float64]
+CAMERAS: tuple[Intrinsics, ...] = ("fixed", "prior")
 ORACLE = Path(__file__).parents[3] / "shared" / "oracles" / "handeye.npz"
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_all_derivatives_equal_finite_differences(mount: str) -> None:
+def test_all_derivatives_equal_finite_differences(mount: Mount) -> None:
     rng = np.random.default_rng(0)
-    given = problem(Setup(count=4, mount=mount), 0)  # type: ignore[arg-type]
+    given = problem(Setup(count=4, mount=mount), 0)
     lens = (0.1, -0.05, 0.001, 0.002, 0.01)
     observations = replace(
         given,
@@ -99,8 +101,8 @@ def test_stored_problems_park_martin_as_opencv_and_the_refinement_ahead_of_all()
         off = se3.difference(ours, stored[f"X_PARK_{k}"])
         assert np.linalg.norm(off[3:]) < 1e-6 * DEGREE
         assert np.linalg.norm(off[:3]) < 1e-9
-        for intrinsics in ("fixed", "prior"):
-            result = calibrate(o, BoardOptions(intrinsics=intrinsics))  # type: ignore[arg-type]
+        for intrinsics in CAMERAS:
+            result = calibrate(o, BoardOptions(intrinsics=intrinsics))
             assert result.status == "converged" and result.T is not None
             degrees, mm = error(result.T, stored[f"X_true_{k}"])
             for method in opencv.METHODS:
@@ -243,8 +245,8 @@ def test_stops_say_nothing_about_speed() -> None:
     np.testing.assert_allclose(velocities(T, 0.1 * np.arange(5.0))[1:4, 0], 2.5)
 
 
-def result_of(o: Observations, **options: object) -> BoardHandEye:
-    return calibrate(o, BoardOptions(**options))  # type: ignore[arg-type]
+def result_of(o: Observations, **options: Any) -> BoardHandEye:
+    return calibrate(o, BoardOptions(**options))
 
 
 def test_equal_inputs_give_equal_bits_and_arguments_stay_as_they_are() -> None:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from depthba import se3
 from depthba.boards import Board
 from depthba.errors import DatasetError, OptionError
-from rig.hand_eye.board.calibration import BoardHandEye, BoardOptions, calibrate
-from rig.hand_eye.board.observations import Observations
+from rig.hand_eye.board.calibration import BoardHandEye, BoardOptions, Intrinsics, calibrate
+from rig.hand_eye.board.observations import Mount, Observations
 from rig.hand_eye.board.suspects import numbering, symmetries
 from tests.rig.board_problems import POINTS, Setup, X, error, observed, problem, views
 
@@ -97,11 +97,12 @@ def test_what_does_not_belong_together_is_named_and_gives_no_number(case: str) -
 def test_the_wrong_mount_is_named_both_ways() -> None:
     in_hand = problem(PLAIN, 1)
     fixed = problem(replace(PLAIN, mount="eye-to-hand"), 1)
-    for o, mount, other in (
+    cases: list[tuple[Observations, Mount, str]] = [
         (in_hand, "eye-to-hand", "--mount eye-in-hand"),
         (fixed, "eye-in-hand", "--mount eye-to-hand"),
-    ):
-        result = calibrate(o, BoardOptions(mount=mount))  # type: ignore[arg-type]
+    ]
+    for o, mount, other in cases:
+        result = calibrate(o, BoardOptions(mount=mount))
         assert result.status == "inconsistent" and other in result.reason
 
 
@@ -149,8 +150,8 @@ def test_turns_of_a_degree_or_two_are_too_few() -> None:
 
 
 @pytest.mark.parametrize(("intrinsics", "off"), [("fixed", (0.001, 1.5)), ("prior", (0.01, 10.0))])
-def test_another_camera_than_was_stated(intrinsics: str, off: tuple[float, float]) -> None:
-    options = BoardOptions(intrinsics=intrinsics)  # type: ignore[arg-type]
+def test_another_camera_than_was_stated(intrinsics: Intrinsics, off: tuple[float, float]) -> None:
+    options = BoardOptions(intrinsics=intrinsics)
     assert calibrate(problem(Setup(), 3), options).trusted
     wrong = calibrate(problem(Setup(camera_off=off), 3), options)
     assert wrong.status == "inconsistent" and wrong.T is None

@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ import pytest
 from depthba.cli import main
 from depthba.dataset import Dataset, verify
 from rig.cameras import names
+from rig.session.interrupts import Interrupts
 from rig.session.opening import opened
 from rig.session.reading import read_session
 from rig.session.record import begin
@@ -267,15 +269,67 @@ def test_a_disk_that_is_full_ends_the_session_which_goes_on_once_there_is_room(
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_ctrl_c_brakes_the_arm_and_leaves_a_whole_dataset(tmp_path: Path, robot: Running) -> None:
+@pytest.mark.parametrize("deaf", [False, True], ids=["heard", "started deaf"])
+def test_ctrl_c_brakes_the_arm_and_leaves_a_whole_dataset(
+    tmp_path: Path, robot: Running, deaf: bool
+) -> None:
     out = tmp_path / "out"
-    process = command(session(tmp_path, robot, **SLOW), "--out", out)
+    # Slower than the others: the signal must not come after the last frame on a busy machine.
+    path = session(tmp_path, robot, **{**SLOW, "motion__speed": 0.05})
+    # As a script starts what it puts into the background.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if deaf else signal.default_int_handler)
+    try:
+        process = command(path, "--out", out)
+    finally:
+        signal.signal(signal.SIGINT, before)
     with when(on_the_way(out, robot), lambda: process.send_signal(signal.SIGINT)) as moment:
         status, _, error = finished(process)
     assert time.monotonic() - moment.at < LONGEST
     assert status == 130 and "1 of 3 frames are whole; the same command goes on" in error
     truth = robot.truth()
     assert not truth["moving"] and abs(truth["joints"][0] - STATIONS[1][0]) > 0.01
+    whole(out, 1)
+
+
+def test_ctrl_c_is_not_lost_where_python_swallows_it(tmp_path: Path, robot: Running) -> None:
+    out = tmp_path / "out"
+    loaded = read_session(session(tmp_path, robot, **SLOW))
+    interrupts = Interrupts()
+
+    class Finalised:
+        """The interpreter lets nothing out of a finaliser."""
+
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    things = [Finalised()]
+    swallowed: list[type[BaseException]] = []
+
+    def said(text: str, done: int, total: int) -> None:
+        if done == 1 and things:
+            things.pop()
+
+    with opened(loaded, loaded, out, rehearsed=False, move=True) as ready:
+        writer = begin(out, loaded, ready.space, ready.plan, ready.info, False)
+        run = Run(
+            loaded,
+            ready.space,
+            ready.plan,
+            ready.carrier,
+            ready.camera,
+            ready.info,
+            writer,
+            Listeners(say=said),
+            interrupts=interrupts,
+        )
+        hook, sys.unraisablehook = sys.unraisablehook, lambda what: swallowed.append(what.exc_type)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                run()
+        finally:
+            sys.unraisablehook = hook
+    assert swallowed == [KeyboardInterrupt]
+    assert not robot.truth()["moving"]
     whole(out, 1)
 
 

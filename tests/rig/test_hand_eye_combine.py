@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,11 +23,11 @@ from tests.rig.arm_scene import X, write_arm
 Floats = NDArray[np.float64]
 
 
-def record(T: Floats, covariance: Floats, **changes: object) -> HandEyeRecord:
+def record(T: Floats, covariance: Floats, **changes: Any) -> HandEyeRecord:
     plain = HandEyeRecord(
         "board", "eye-in-hand", "converged", True, "the motions fix it", T, covariance
     )
-    return replace(plain, **changes)  # type: ignore[arg-type]
+    return replace(plain, **changes)
 
 
 def drawn(rng: np.random.Generator) -> tuple[Floats, Floats]:

@@ -14,8 +14,9 @@ from depthba.errors import OutOfReach
 from depthba.kinematics import UR16E
 from rig.session.aims import dome_poses, facing, grid_poses, look_pose, step_positions
 from rig.session.carriers import make_carrier
-from rig.session.options import Dome, Grid, Look, Session, Steps
+from rig.session.options import Session
 from rig.session.planning import Plan, plan
+from rig.session.poses import Dome, Grid, Look, Steps
 from rig.session.reading import read_session
 from rig.session.record import as_stored, differences
 from rig.session.workspace import Workspace

@@ -26,6 +26,20 @@ def test_a_profile_keeps_its_limits_and_covers_its_length(length: float, speed: 
         assert v.max() == pytest.approx(min(speed, np.sqrt(length * 2.0)), rel=1e-2)
 
 
+def test_a_glimpse_from_another_thread_sees_the_same_and_changes_nothing() -> None:
+    one, other = (Carriage(Mechanics(parked=(0.3, 0.1))) for _ in range(2))
+    for carriage in (one, other):
+        carriage.home(0.0, leave=0.004)
+    for now in np.arange(0.0, 12.0, 0.137):
+        assert one.doing(now) is other.doing(now)
+        # A little later, while nobody has let anything happen.
+        later = now + 0.01
+        if other.doing(later) is one.doing(now):
+            np.testing.assert_allclose(one.glimpse(later), other.position(later), atol=2e-6)
+    assert one.homed
+    np.testing.assert_allclose(one.glimpse(20.0), 0.004, atol=1e-6)
+
+
 def test_braking_takes_the_shortest_way() -> None:
     profile = braking(0.4, 2.0)
     assert profile.duration == pytest.approx(0.2)

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 import sim
 from depthba import se3
+from depthba.board_views import Views
 from depthba.boards import Board
 from depthba.dataset import Dataset, verify
 from depthba.errors import OptionError
 from sim import calibration
 from sim.engine import mujoco
 from sim.errors import SimulationError
-from sim.rigs.board_arm import BoardArm, Views
+from sim.rigs.board_arm import BoardArm
 from sim.rigs.track import Track
 from sim.scenes import SCENES
 from sim.scenes.board import add_print

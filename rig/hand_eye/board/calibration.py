@@ -25,6 +25,7 @@ from rig.hand_eye.board.verdict import (
     Status,
     Tested,
     Verdict,
+    camera_doubt,
     judge,
     tested_clock,
 )
@@ -58,8 +59,8 @@ class BoardOptions:
     """What the camera is fixed to: eye-in-hand, the flange, with the board standing still;
     eye-to-hand, the world, with the board on the flange."""
     intrinsics: Intrinsics = "prior"
-    """The camera's numbers: prior, those of dataset.json, known to 0.1 %; fixed, those exactly;
-    estimated, from the images alone, with the lens's distortion."""
+    """The camera's numbers: prior, those of dataset.json, known to 0.1 % or better, as the images
+    have it; fixed, those exactly; estimated, from the images alone, with the lens's distortion."""
     robot_sigma: tuple[float, float] | None = None
     """How well the robot repeats a flange pose: standard deviations along and about each axis, m
     and degrees. None: found from the data, about 0.00005 m and 0.01 degrees."""
@@ -189,6 +190,12 @@ def calibrate(
             f"the camera's stamps are {1e3 * clock.value:+.1f} ms off the robot's (sigma"
             f" {1e3 * clock.sigma:.1f}): this was put right"
         )
+    if options.intrinsics == "prior":
+        believed = found.solution.problem.prior
+        doubt = camera_doubt(found.solution)
+        narrowed = replace(believed, lens=tuple(doubt * sigma for sigma in believed.lens))
+        found = estimate(observations, beginning, P, narrowed, stated)
+        notes.append(f"by the images the camera's numbers are known to {100 * FOCAL * doubt:.2g} %")
     if observations.stamps is not None and observations.stamps_robot is not None:
         notes += _stamp_notes(observations)
     away = np.linalg.norm(P[:, :3, 3], axis=1)

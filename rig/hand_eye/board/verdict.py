@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from depthba.optimiser.certainty import direction_name
 from rig.hand_eye.board.chain import CLOCK, LENS, SIZE, X
 from rig.hand_eye.board.estimate import UNLIKELY, Estimate
+from rig.hand_eye.board.noise import Prior
 from rig.hand_eye.board.refine import Solution, minimise
 from rig.hand_eye.board.views import displacement
 from rig.hand_eye.flanges import motion_fault, turned
@@ -37,6 +38,8 @@ LOOSE = 0.01
 # Turns about a second axis (root mean square, rad) below which noise passes for knowledge.
 LITTLE = float(np.radians(3.0))
 LENS_MATTERS = 0.0005
+# By what shares of what the prior allows given numbers of a camera may be off.
+DOUBTS = (0.0, 0.1, 0.3, 1.0)
 SIZE_MATTERS, CLOCK_MATTERS = 0.003, 0.001
 
 
@@ -108,8 +111,30 @@ def lens_fault(solution: Solution) -> str:
     )
 
 
-def _tested(solution: Solution, prior: object, index: int) -> Tested | None:
-    problem = replace(solution.problem, prior=prior)  # type: ignore[arg-type]
+def camera_doubt(solution: Solution) -> float:
+    """Return by how much the camera is to be doubted, as a share of what the prior allows, 0 to 1.
+
+    How wrong given numbers usually are nobody knows: they may be exact. Each of `DOUBTS` is a prior
+    as narrow, all alike before; each is worth its evidence, the density that it gave to what the
+    images say (MacKay 1992), by the normal approximation to that. Returned is the root mean square.
+    """
+    sigma = np.array(solution.problem.prior.lens)
+    bound = np.flatnonzero(sigma > 0)
+    rows = LENS.start + bound
+    C = solution.covariance[np.ix_(rows, rows)] / np.outer(sigma[bound], sigma[bound])
+    # what the images alone say: its precision along its axes, and times where it lies
+    values, axes = np.linalg.eigh(C)
+    precision = np.maximum(1.0 / values - 1.0, 0.0)
+    pull = (axes.T @ (solution.chain.lens[bound] / sigma[bound])) / values
+    square = np.square(DOUBTS)[:, None]
+    narrowed = 1.0 + square * precision
+    log = 0.5 * (square * pull**2 / narrowed - np.log(narrowed)).sum(axis=1)
+    weight = np.exp(log - log.max())
+    return float(np.sqrt(weight @ np.square(DOUBTS) / weight.sum()))
+
+
+def _tested(solution: Solution, prior: Prior, index: int) -> Tested | None:
+    problem = replace(solution.problem, prior=prior)
     free = minimise(problem, solution.chain, 20)
     sigma = float(np.sqrt(free.covariance[index, index]))
     if sigma > 0.3:
