@@ -63,8 +63,16 @@ def test_a_protective_stop_ends_the_move_and_holds_until_released(
     with ends_in_time(), pytest.raises(ProtectiveStop):
         UrArm(arm.options).connect()
     running.fault("protective-stop", False)
+    released(arm)
     # The control script is started anew by itself.
     assert arm.move_joints(READY, speed=0.5, acceleration=2.0).safety is Safety.NORMAL
+
+
+def released(arm: UrArm) -> None:
+    """Wait until the arm's own stream tells of the release, which a loaded machine delays."""
+    until = time.monotonic() + LONGEST
+    while arm.state().safety is not Safety.NORMAL and time.monotonic() < until:
+        time.sleep(0.01)
 
 
 def test_an_emergency_stop_too(arm: UrArm, running: Running) -> None:
@@ -74,6 +82,7 @@ def test_an_emergency_stop_too(arm: UrArm, running: Running) -> None:
     with ends_in_time(), pytest.raises(EmergencyStop):
         UrArm(arm.options).connect()
     running.fault("emergency-stop", False)
+    released(arm)
     arm.move_joints(READY, speed=0.5, acceleration=2.0)
 
 
