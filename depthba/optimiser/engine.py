@@ -237,11 +237,10 @@ class Engine:
         index: int, levels: int, known: certainty.Correlation | None, final: bool,
     ) -> tuple[float, Outcome]:  # fmt: skip
         """Weigh the measured poses by what is known, and solve; return their weight too."""
-        believed = known.inflation if known else 1.0
-        temperature = believed * robust_sigma(lin.residuals) ** 2 if known else 0.0
+        temperature = known.inflation * robust_sigma(lin.residuals) ** 2 if known else 0.0
         sure = self._sure(level, state, lin, near.S, temperature)
         outcome = self._solve(
-            level, state, lin, phase, index, levels, temperature, believed, near.S, sure, final
+            level, state, lin, phase, index, levels, temperature, known, near.S, sure, final
         )
         return temperature, outcome
 
@@ -273,15 +272,20 @@ class Engine:
 
     def _solve(
         self, level: Level, state: State, lin: Linearisation, phase: str, index: int, levels: int,
-        temperature: float, believed: float, near: NDArray[np.float64],
+        temperature: float, known: certainty.Correlation | None, near: NDArray[np.float64],
         sure: NDArray[np.float64] | None, final: bool,
     ) -> Outcome:  # fmt: skip
+        believed, variance = known.inflation if known else 1.0, robust_sigma(lin.residuals) ** 2
+        # what steps so long lower the cost by, where residuals are as correlated as they are here:
+        # frames that slide would go on for as long as they may
+        step = PASSING**2 * 6 * max(int(self.free.sum()), 1) * variance
         rules = Rules(
             _scale(self.preset, phase),
             self.options.max_iterations,
             settled=self.settled if final else PASSING,
             steady=final and level.tied is not None,
             gain=(ENOUGH if level.tied else 0.0) if final else GAIN,
+            least=step * max(believed, known.overall) if known else 0.0,
             believed=believed,
         )
 

@@ -53,6 +53,8 @@ class Rules:
     gain: float = 0.0
     """Enough when a step lowers the cost by less than this share: a coarse level only has to bring
     the next into reach."""
+    least: float = 0.0
+    """Enough when a step lowers the cost by less than this, m^2."""
     believed: float = 1.0
     """Factor of the poses' variance over what independent residuals would leave: it scales the
     standard deviations above."""
@@ -237,7 +239,7 @@ def solve_level(
                 damping = max(10 * damping, 1e-2)
             mixer.forget()
         report(Progress(state, lin, before_cost, step, damping, accepted, sigma))
-        enough = rules.gain > 0 and before_cost - after_cost < rules.gain * before_cost
+        enough = before_cost - after_cost < max(rules.gain * before_cost, rules.least)
         if accepted and (small or enough):
             converged = True
             break
