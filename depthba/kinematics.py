@@ -130,14 +130,18 @@ class DhArm:
 
         Right: every component of `se3.difference` is at most `tolerance` (m and rad) and the limits
         are kept, if need be by full turns. Damped Newton steps (Levenberg's damping, which falls
-        with the error, as in Sugihara 2011); a step turns no joint by more than 0.5 rad.
+        with the error, as in Sugihara 2011); a step turns no joint by more than 0.5 rad. Poses
+        beyond the arm's length are not tried.
         """
         T_goal, q0 = np.asarray(T_base_flange, float), self._checked(q0)
         shape = np.broadcast_shapes(T_goal.shape[:-2], q0.shape[:-1])
         n = len(self.joints)
         T_goal = np.broadcast_to(T_goal, (*shape, 4, 4)).reshape(-1, 4, 4)
         q = np.broadcast_to(q0, (*shape, n)).reshape(-1, n).copy()
-        right, busy = np.zeros(len(q), np.bool_), np.arange(len(q))
+        right = np.zeros(len(q), np.bool_)
+        # Farther away than all links in one line: no joints lead there.
+        reach = float(np.hypot(self.a, self.d).sum()) + tolerance
+        busy = np.flatnonzero(np.linalg.norm(T_goal[:, :3, 3], axis=-1) <= reach)
         for _ in range(steps + 1):
             frames = self.frames(q[busy])
             error = se3.difference(T_goal[busy], frames[:, -1])
