@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,6 +24,7 @@ from rig.session.carriers import Carrier, Standing, await_still
 from rig.session.options import Session
 from rig.session.planning import Plan
 from rig.session.record import Skipped, note_skipped, progress
+from rig.session.steady import SteadyClock
 from rig.session.workspace import Workspace
 
 Array = NDArray[np.float64]
@@ -90,9 +91,14 @@ class Run:
     listeners: Listeners = field(default_factory=Listeners)
     again: bool = False
     """Try the stations that an earlier run skipped once more, at the end."""
+    _clock: SteadyClock = field(init=False)
     _before: Capture | None = None
     _retries: int = 0
     _stops: int = 0
+
+    def __post_init__(self) -> None:
+        """Set the session's clock."""
+        self._clock = SteadyClock(self.writer.stamps)
 
     def __call__(self) -> Summary:
         """Go to every station that has no frame yet.
@@ -217,9 +223,9 @@ class Run:
                     f"{self.carrier.who}: stands {away:.3g} {self.space.body.unit} from"
                     f" {self.plan.labels[k]}, expected at most {10.0 * session.motion.still:g}"
                 )
-            since = time.time()
+            since = self._clock.now()
             capture = self.camera.capture(session.camera.timeout)
-            now = time.time()
+            now, stamp = self._clock.now(), self._clock.of(capture)
             after = self.carrier.state()
         except CameraTimeout as error:
             self._revive()
@@ -227,13 +233,15 @@ class Run:
         T_world_camera = self.space.T_world_base @ standing.T_base_flange
         T_world_camera = T_world_camera @ self.space.T_flange_camera
         self.listeners.moved(T_world_camera, since)
+        jumped = capture.stamp - stamp
+        since, now = since + jumped, now + jumped
         reason = self._moved(standing, after) or check(
             capture, self.info, session.frames, since=since, now=now, before=self._before
         )
         if reason is not None:
             return reason
         self._before = capture
-        self._commit(k, standing, T_world_camera, capture)
+        self._commit(k, standing, T_world_camera, replace(capture, stamp=stamp))
         return None
 
     def _revive(self) -> None:
