@@ -140,15 +140,22 @@ def rendered(dataset: Dataset, T_true: Floats) -> list[Floats] | None:
     source = dataset.header.get("source", {})
     if source.get("tool") != "depthba generate" or "config" not in source:
         return None
+    from sim import stored_scene
     from sim.capture import Capture  # MuJoCo and Embree take a while to import
     from sim.options import GenerateOptions
-    from sim.scenes import find_scene
+    from sim.scenes import SCENES, find_scene
 
     config: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()
     }
-    stored = dataset.path / "scene" / "scene.xml"
-    scene = str(stored) if "scene_sha256" in source else source["scene"]
+    # A dataset may come from anybody: no code that it names is run, and no file outside is read.
+    if "scene_sha256" in source:
+        stored_scene.read(dataset.path)
+        scene = str(dataset.path / stored_scene.SCENE)
+    elif source.get("scene") in SCENES:
+        scene = source["scene"]
+    else:
+        return None
     capture = Capture.plan(find_scene(scene), GenerateOptions(**config))
     planned = capture.track.T_world_camera_true
     rows = [frame.id for frame in dataset]

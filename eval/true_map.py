@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from depthba.clouds import transform
 from depthba.dataset import Dataset
+from depthba.errors import DatasetError
+from sim import stored_scene
 
 Floats = NDArray[np.float64]
 
-SCENE = Path("scene") / "scene.xml"
-"""MJCF, relative to a dataset: what `depthba generate` renders, digit for digit."""
 NEEDED = ("mujoco", "embreex")
 """Packages that read it; without them there is no true map."""
 
@@ -23,12 +23,23 @@ class TrueSurface:
     """The scene that a dataset was rendered from, without what has joints: a robot's arm."""
 
     def __init__(self, path: Path) -> None:
-        """Read the scene in the dataset folder ``path``; `MissingPackage` without the simulator."""
+        """Read the scene in the dataset folder ``path``: what `depthba generate` rendered.
+
+        `MissingPackage` without the simulator; `DatasetError` where the scene names what is not
+        the dataset's, or is none.
+        """
         from sim.engine import mujoco  # takes a second, and few datasets need it
         from sim.rendering.raycast import RayScene
         from sim.rendering.tessellate import Shapes, Triangles
 
-        model = mujoco.MjModel.from_xml_path(str(path / SCENE))
+        xml, files = stored_scene.read(path)
+        try:
+            model = mujoco.MjModel.from_xml_string(xml, files)
+        except ValueError as error:
+            line = " ".join(str(error).split())
+            raise DatasetError(
+                f"{path / stored_scene.SCENE}: {line}, expected an MJCF model"
+            ) from (error)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         soup = Shapes(model).at(data)
@@ -40,7 +51,9 @@ class TrueSurface:
     @classmethod
     def of(cls, dataset: Dataset) -> TrueSurface | None:
         """Return the true surface of a dataset; None where it or a package is not there."""
-        if not (dataset.path / SCENE).is_file() or not all(map(importlib.util.find_spec, NEEDED)):
+        if not (dataset.path / stored_scene.SCENE).is_file() or not all(
+            map(importlib.util.find_spec, NEEDED)
+        ):
             return None
         return cls(dataset.path)
 

@@ -18,7 +18,7 @@ from depthba import __version__
 from depthba.dataset import Dataset, DatasetWriter, Marker
 from depthba.durable import write_bytes, write_json, write_text
 from depthba.errors import DatasetError
-from sim import calibration
+from sim import calibration, stored_scene
 from sim.capture import Capture
 from sim.markers import discs_of, observe
 from sim.noise import stated_noise
@@ -137,7 +137,8 @@ def draw_stages(scene: str, path: str | Path, options: GenerateOptions, frame: i
 def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = None) -> Path:
     """Render a generated dataset anew from what it says about itself; equal bytes come out.
 
-    A scene that was an MJCF file is read from the dataset itself, whose own hash is then another.
+    A scene that was an MJCF file is read from the dataset itself, whose own hash is then another;
+    one that a function built is built by it anew: rebuild no such dataset of somebody else's.
     DatasetError where `dataset` was not generated, or with other versions than those here.
     """
     source = Dataset.open(dataset).header.get("source", {})
@@ -151,8 +152,10 @@ def rebuild(dataset: str | Path, out: str | Path, progress: Progress | None = No
     config: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in source["config"].items()
     }
-    stored = Path(dataset) / "scene" / "scene.xml"
-    scene = str(stored) if "scene_sha256" in source else source["scene"]
+    scene = source["scene"]
+    if "scene_sha256" in source:
+        stored_scene.read(dataset)
+        scene = str(Path(dataset) / stored_scene.SCENE)
     return generate(scene, out, GenerateOptions(**config), progress)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
 from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
-from depthba.optimiser.slope_noise import firm
+from depthba.optimiser.slope_noise import MANY, firm, largest_share
 from depthba.optimiser.workers import Workers
 from depthba.result import WeakDirection
 
@@ -128,18 +129,43 @@ def correlation(
     factor = 1.0
     for _ in range(10):
         look()
-        V = np.linalg.inv(inner + max(factor * variance, 1e-30) * P)
-        spread = [float(np.einsum("bi,ij,bj->", s @ V, P, s @ V)) for s in scores]
+        moved = _solved(inner + max(factor * variance, 1e-30) * P, list(scores))
+        spread = [_form(x, P) for x in moved]
+        before = factor
         factor = max(1.0, max(spread[0], spread[-1]) / max(spread[1], 1e-300))
-    V = np.linalg.inv(inner + max(variance, 1e-30) * P)
-    mixed = (_neighbours_mixed(scores[0]), *scores[1:])
-    alike = [float(np.einsum("bi,ij,bj->", s, V, s)) for s in mixed]
+        if factor == before:
+            break
+    mixed = [_neighbours_mixed(scores[0]), *scores[1:]]
+    moved = _solved(inner + max(variance, 1e-30) * P, mixed)
+    alike = [float(np.vdot(s, x)) for s, x in zip(mixed, moved, strict=True)]
     overall = max(1.0, max(alike[0], alike[-1]) / max(alike[1], 1e-300))
     T = max(factor * variance, 1e-30)
-    owed = float(eigh(T * P, inner + T * P, eigvals_only=True)[-1])
+    owed = largest_share(T * P, inner + T * P)
     whole = np.zeros((count, len(S)))
     whole[:, keep] = scores[0]
     return Correlation(factor, overall, S, owed, whole)
+
+
+def _solved(
+    whole: NDArray[np.float64], scores: Sequence[NDArray[np.float64]]
+) -> list[NDArray[np.float64]]:
+    """Return ``whole^-1 s`` for each kind of scores s, (blocks, d).
+
+    Few unknowns are answered by the inverse, digit for digit what they always were.
+    """
+    d = len(whole)
+    if d <= MANY:
+        V = np.linalg.inv(whole)
+        return [s @ V for s in scores]
+    found = np.linalg.solve(whole, np.concatenate(scores).T).T
+    return np.split(np.asarray(found), len(scores))
+
+
+def _form(x: NDArray[np.float64], M: NDArray[np.float64]) -> float:
+    """Return the sum of ``x_b^T M x_b`` over blocks b; x (blocks, d)."""
+    if len(M) <= MANY:
+        return float(np.einsum("bi,ij,bj->", x, M, x))
+    return float(np.vdot(x @ M, x))
 
 
 def _neighbours_mixed(scores: NDArray[np.float64]) -> NDArray[np.float64]:

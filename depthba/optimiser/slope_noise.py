@@ -12,9 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
+from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from depthba.optimiser import map_kernels, probes, reduced
+from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import (
@@ -32,6 +34,8 @@ SLIGHT = 0.02
 # What the data say counts as far as it exceeds this many times what noise alone would: what noise
 # truly put in scatters about what a draw of it would have.
 MARGIN = 2.0
+# Unknowns above which single eigenvalues are not got by finding all of them.
+MANY = 600
 # Tolerance of the solves: a draw of noise need not be eliminated exactly.
 ROUGHLY = 0.1
 
@@ -75,11 +79,12 @@ def without_slope_noise(
     keep = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
     if not free.any():
         return S, 0.0
-    found = _largest_share(bound[keep], (S + held)[keep])
+    whole = firm((S + held)[keep])
+    found = largest_share(bound[keep], whole)
     if found < share:
         return S, found
     noise = variance * reduced.exact(noisy, workers, ROUGHLY)
-    found = _largest_share(noise[keep], (S + held)[keep])
+    found = largest_share(noise[keep], whole)
     if found < share:
         return S, found
     out = S.copy()
@@ -87,8 +92,32 @@ def without_slope_noise(
     return out, found
 
 
-def _largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
-    return float(eigh(part, firm(whole), eigvals_only=True)[-1])
+def largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+    """Return the largest share that a part has in any direction of a whole, both (d, d).
+
+    That is the largest ``x^T part x / x^T whole x``; the part is no less than nothing in any
+    direction, the whole is definite. Few unknowns: all such values are found (Golub & Van Loan
+    2013, 8.7); many: the largest alone, by Lanczos' method, whose steps cost d^2 and not d^3.
+    """
+    d = len(part)
+    if d <= MANY:
+        return float(eigh(part, whole, eigvals_only=True)[-1])
+    if not part.any():
+        return 0.0
+    root = cholesky(whole, lower=True)
+
+    def times(v: NDArray[np.float64]) -> NDArray[np.float64]:
+        look()
+        inner = part @ solve_triangular(root, v.ravel(), trans="T", lower=True, check_finite=False)
+        return np.asarray(solve_triangular(root, inner, lower=True, check_finite=False))
+
+    # the same start every time
+    start = np.random.default_rng(0).standard_normal(d)
+    operator = LinearOperator((d, d), matvec=times, dtype=np.float64)
+    try:
+        return float(eigsh(operator, 1, which="LA", v0=start, return_eigenvectors=False)[0])
+    except ArpackNoConvergence:
+        return float(eigh(part, whole, eigvals_only=True)[-1])
 
 
 def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -101,10 +130,22 @@ def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
     own = np.maximum(own, 1e-12 * np.max(own, initial=1e-300))
     root = np.sqrt(own)  # of each: products of tiny ones would be nothing
     scaled = whole / np.outer(root, root)
+    if len(whole) > MANY and _definite(scaled):
+        return whole
     values = np.linalg.eigvalsh(scaled)
     # rows that are next to nothing beside what couples them to others make for large values
     least = max(1e-9, 1e-12 * float(values[-1]))
     return np.asarray(whole + max(least - float(values[0]), 0.0) * np.diag(own))
+
+
+def _definite(scaled: NDArray[np.float64]) -> bool:
+    """Tell whether a matrix lies clear of the floor of `firm`, without any of its eigenvalues."""
+    largest = float(np.max(np.abs(scaled).sum(axis=1)))  # no eigenvalue is larger (Gershgorin)
+    try:
+        np.linalg.cholesky(scaled - 2.0 * max(1e-9, 1e-12 * largest) * np.eye(len(scaled)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _less(

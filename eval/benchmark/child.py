@@ -1,11 +1,13 @@
 """Runs one method on one dataset in a process of its own.
 
 ``python -m eval.benchmark.child FOLDER``: ``FOLDER/request.json`` says what to do; ``poses.txt``
-and ``outcome.json`` are left there.
+and ``outcome.json`` are left there. Where a disk takes nothing more there is no outcome, for that
+says nothing of a method: the process ends with the status `NO_DISK`.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -27,18 +29,39 @@ from eval.benchmark.warming import warm
 from eval.methods import MethodError, Task, find_method
 
 REQUEST = "request.json"
+NO_DISK = 74
+"""Status of a process whose disk is full or read-only (EX_IOERR of sysexits.h)."""
+_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 def main(folder: Path) -> None:
-    """Do what the request says; every end but a crash leaves an outcome."""
+    """Do what the request says; every end but a crash or a disk's leaves an outcome."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     request = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
     blank = Outcome.of_json(request["outcome"])
-    run(folder, request, blank).write(folder)
+    try:
+        run(folder, request, blank).write(folder)
+    except Exception as error:
+        refused = disk_error(error)
+        if refused is None:
+            raise
+        _say(refused.strerror or str(refused))
+        os._exit(NO_DISK)  # at once: a thread that hears stdin cannot be waited for
+
+
+def disk_error(error: BaseException | None) -> OSError | None:
+    """Return what a disk said that takes nothing more, if that is behind an error."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, OSError) and error.errno in _DISK:
+            return error
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def run(folder: Path, request: dict[str, Any], blank: Outcome) -> Outcome:
-    """Run the method and judge what it found."""
+    """Run the method and judge what it found; what a full disk ends is raised."""
     dataset = Dataset.open(request["dataset"])
     if request["first"] is not None:
         dataset = dataset.subset(range(min(request["first"], len(dataset))))
@@ -54,10 +77,14 @@ def run(folder: Path, request: dict[str, Any], blank: Outcome) -> Outcome:
     except MissingPackage as error:
         return replace(blank, status="missing", reason=_line(error))
     except (MethodError, DepthbaError) as error:
+        if disk_error(error):
+            raise
         return replace(blank, status="failed", reason=_line(error), memory=_most_memory())
     except MemoryError:
         return replace(blank, status="memory", reason="no memory left", memory=_most_memory())
     except Exception as error:
+        if disk_error(error):
+            raise
         at = traceback.extract_tb(error.__traceback__)[-1]
         reason = f"{type(error).__name__}: {_line(error)} ({Path(at.filename).name}:{at.lineno})"
         return replace(blank, status="crashed", reason=reason, memory=_most_memory())

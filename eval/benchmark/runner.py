@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import replace
+from typing import IO
 
 from depthba import durable
 from depthba.errors import DepthbaError, OptionError
 from eval.benchmark import outcome
-from eval.benchmark.child import REQUEST
+from eval.benchmark.child import NO_DISK, REQUEST
 from eval.benchmark.outcome import Outcome
 from eval.benchmark.plan import Case, Job
 from sim.workers import ClusterWorkers, LocalWorkers, Workers, cores
@@ -161,7 +162,10 @@ def _make_dataset(job: Job) -> None:
 
 
 def _run_method(job: Job, method: str) -> None:
-    """Run a method in a child process; whatever becomes of it, an outcome is there then."""
+    """Run a method in a child process; whatever becomes of it, an outcome is there then.
+
+    OSError: a disk takes nothing more. That is no outcome: the method runs again.
+    """
     folder = job.folder(method)
     folder.mkdir(parents=True, exist_ok=True)
     for name in (outcome.FILE, outcome.POSES):
@@ -194,6 +198,8 @@ def _run_method(job: Job, method: str) -> None:
             if child.stdin is not None:
                 child.stdin.close()
         (folder / REQUEST).unlink(missing_ok=True)
+        if child.returncode == NO_DISK and ended is None:
+            raise OSError(_last_line(log) or "the disk takes nothing more")
         if outcome.read(folder) is None:
             status, reason, memory = ended or ("crashed", _last_words(child.returncode, log), None)
             replace(blank, status=status, reason=reason, memory=memory).write(folder)
@@ -221,15 +227,19 @@ def _watch(child: subprocess.Popen[bytes], job: Job) -> tuple[outcome.Status, st
             return "time", f"stopped: it took longer than {job.seconds:.0f} s", most
 
 
-def _last_words(status: int | None, log: object) -> str:
+def _last_words(status: int | None, log: IO[bytes]) -> str:
     """Say how a process ended that left nothing."""
-    assert hasattr(log, "seek") and hasattr(log, "read")
-    log.seek(0)
-    lines = log.read().decode(errors="replace").strip().splitlines()
-    said = f": {lines[-1].strip()}" if lines else ""
+    line = _last_line(log)
+    said = f": {line}" if line else ""
     if status is not None and status < 0:
         return f"its process was ended by signal {-status}{said}"[:300]
     return f"its process ended with status {status}{said}"[:300]
+
+
+def _last_line(log: IO[bytes]) -> str:
+    log.seek(0)
+    lines = log.read().decode(errors="replace").strip().splitlines()
+    return lines[-1].strip() if lines else ""
 
 
 def check(workers: int | None, scheduler: str | None) -> None:

@@ -16,7 +16,7 @@ import threading
 from typing import Any
 
 from depthba.errors import DepthbaError, MissingPackage
-from rig.cameras.camera import CameraInfo, Capture
+from rig.cameras.camera import CameraInfo, Capture, moment_of
 from rig.cameras.finding import make
 from rig.errors import CameraTimeout
 
@@ -43,7 +43,7 @@ class Owner:
         """One frame."""
         found = self._camera.capture(timeout)
         truth = getattr(found, "T_world_camera_true", None)
-        return Capture(found.depth, found.stamp, found.rgb, truth)
+        return Capture(found.depth, found.stamp, found.rgb, truth, moment_of(found.stamp))
 
     def close(self) -> None:
         """Let go of it."""

@@ -6,6 +6,7 @@ A user adds one with a class like this and an entry point of the group ``depthba
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -48,6 +49,14 @@ class Capture:
     """(height, width, 3) or None."""
     T_world_camera_true: NDArray[np.float64] | None = None
     """(4, 4), which a simulation alone knows."""
+    moment: float | None = None
+    """`stamp` on the steady clock (`time.monotonic`), s. Cameras need not say it: whoever owns one
+    does."""
+
+
+def moment_of(stamp: float) -> float:
+    """Return where on the steady clock a stamp of the wall clock lies, s; asked soon after it."""
+    return time.monotonic() - (time.time() - stamp)
 
 
 class DepthCamera(Protocol):

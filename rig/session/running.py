@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from rig.session.interrupts import Interrupts
 from rig.session.options import Session
 from rig.session.planning import Plan
 from rig.session.record import Skipped, note_skipped, progress
+from rig.session.steady import SteadyClock
 from rig.session.workspace import Workspace
 
 Array = NDArray[np.float64]
@@ -89,9 +90,14 @@ class Run:
     """Try the stations that an earlier run skipped once more, at the end."""
     interrupts: Interrupts = field(default_factory=Interrupts)
     """Who hears Ctrl-C."""
+    _clock: SteadyClock = field(init=False)
     _before: Capture | None = None
     _retries: int = 0
     _stops: int = 0
+
+    def __post_init__(self) -> None:
+        """Set the session's clock."""
+        self._clock = SteadyClock(self.writer.stamps)
 
     def __call__(self) -> Summary:
         """Go to every station that has no frame yet.
@@ -223,9 +229,9 @@ class Run:
                     f" {self.plan.labels[k]}, expected at most {10.0 * session.motion.still:g}"
                 )
             self.interrupts.check()
-            since = time.time()
+            since = self._clock.now()
             capture = self.camera.capture(session.camera.timeout)
-            now = time.time()
+            now, stamp = self._clock.now(), self._clock.of(capture)
             after = self.carrier.state()
         except CameraTimeout as error:
             self._revive()
@@ -233,13 +239,15 @@ class Run:
         T_world_camera = self.space.T_world_base @ standing.T_base_flange
         T_world_camera = T_world_camera @ self.space.T_flange_camera
         self.listeners.moved(T_world_camera, since)
+        jumped = capture.stamp - stamp
+        since, now = since + jumped, now + jumped
         reason = self._moved(standing, after) or check(
             capture, self.info, session.frames, since=since, now=now, before=self._before
         )
         if reason is not None:
             return reason
         self._before = capture
-        self._commit(k, standing, T_world_camera, capture)
+        self._commit(k, standing, T_world_camera, replace(capture, stamp=stamp))
         return None
 
     def _revive(self) -> None:

@@ -22,17 +22,20 @@ def small_dataset(path: Path) -> None:
     sim.generate("industrial-6", path, options)
 
 
-def table(rows: list[tuple[str, str, Tally]]) -> str:
-    """Return the table of trust.md."""
-    lines = ["| verb | what happens | runs | committed before | lost | did not go on |"]
-    lines += ["|---|---|---:|---:|---:|---:|"]
+def table(rows: list[tuple[str, str, Tally]], before: str = "") -> str:
+    """Return the table of trust.md; rows ``before`` that were not run anew stay."""
+    found = {}
+    for line in before.splitlines():
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if len(cells) == 6 and cells[1] in FAULTS:
+            found[cells[0], cells[1]] = [int(count) for count in cells[2:]]
     for verb, fault, t in rows:
         if t.runs:
-            lines.append(
-                f"| {verb} | {fault} | {t.runs} | {t.committed} | {t.lost} | {len(t.broken)} |"
-            )
-    total = [sum(x) for x in zip(*((t.runs, t.committed, t.lost, len(t.broken))
-                                   for _, _, t in rows), strict=True)]  # fmt: skip
+            found[verb, fault] = [t.runs, t.committed, t.lost, len(t.broken)]
+    lines = ["| verb | what happens | runs | committed before | lost | did not go on |"]
+    lines += ["|---|---|---:|---:|---:|---:|"]
+    lines += ["| " + " | ".join((*k, *map(str, v))) + " |" for k, v in found.items()]
+    total = [sum(counts) for counts in zip(*found.values(), strict=True)]
     lines.append("| all | | " + " | ".join(map(str, total)) + " |")
     return "\n".join(lines)
 
@@ -73,8 +76,8 @@ def main() -> int:
                     print(f"  {line}", flush=True)
                 if not asked.no_page:
                     before, _, rest = PAGE.read_text().partition(BEGIN)
-                    after = rest.partition(END)[2]
-                    PAGE.write_text(f"{before}{BEGIN}\n{table(rows)}\n{END}{after}")
+                    old, _, after = rest.partition(END)
+                    PAGE.write_text(f"{before}{BEGIN}\n{table(rows, old)}\n{END}{after}")
     print(table(rows))
     return 1 if any(t.lost or t.broken for _, _, t in rows) else 0
 

@@ -222,18 +222,18 @@ def _kill(process: subprocess.Popen[str]) -> None:
 
 
 def killed(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
-    """SIGKILL at a random moment, to the run and all that it has started."""
+    """SIGKILL soon after so many files are there, to the run and all that it has started."""
     process = start(verb.words(out))
-    wait_for(process, out, rng.randrange(files + 1))
+    wait_for(process, out, files)
     time.sleep(rng.uniform(0.0, 0.05))
     _kill(process)
     ended(process)
 
 
 def filled(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
-    """The disk is full from a random moment on."""
+    """The disk is full once so many files are there."""
     process = start(verb.words(out))
-    wait_for(process, out, rng.randrange(files + 1))
+    wait_for(process, out, files)
     others = out.parent / "others"
     try:
         with others.open("wb", 0) as file:
@@ -248,9 +248,9 @@ def filled(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
 
 
 def read_only(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
-    """The disk takes nothing more from a random moment on."""
+    """The disk takes nothing more once so many files are there."""
     process = start(verb.words(out))
-    wait_for(process, out, rng.randrange(files + 1))
+    wait_for(process, out, files)
     disk = str(out.parent)
     while process.poll() is None:  # it is refused while a file is open
         if subprocess.run(["mount", "-o", "remount,ro", disk], capture_output=True).returncode == 0:
@@ -265,7 +265,7 @@ def read_only(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
 def jumped(verb: Verb, out: Path, rng: random.Random, files: int) -> None:
     """The wall clock jumps back and forth, and the run is killed besides."""
     process = start(verb.words(out), clock=rng.randrange(1000))
-    wait_for(process, out, rng.randrange(files + 1))
+    wait_for(process, out, files)
     _kill(process)
     ended(process)
     again = () if not out.exists() or not any(out.iterdir()) else verb.again
@@ -302,7 +302,10 @@ def trial(verb: Verb, fault: str, folder: Path, seed: int, expected: dict[str, s
     """
     tally, rng = Tally(runs=1), random.Random(f"{verb.name} {fault} {seed}")
     disk = fault.endswith("disk")
-    files = 4 + 3 * len(expected)
+    # late, in the middle and early in turn, by the files that are there: something is to be lost
+    third = 2 - seed % 3
+    most = 4 + 3 * len(expected)
+    files = rng.randint(third * most // 3, (third + 1) * most // 3)
     try:
         if disk:
             with small_disk(folder, "24m"):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import eigh
 
 from depthba.optimiser import kernels, probes
 from depthba.optimiser.feet import Feet
-from depthba.optimiser.slope_noise import MARGIN, _less
+from depthba.optimiser.slope_noise import MANY, MARGIN, _less, firm, largest_share
 
 
 def test_jacobians_of_slope_noise_against_plain_numpy() -> None:
@@ -58,3 +61,17 @@ def test_what_is_left_is_never_less_than_nothing() -> None:
     assert np.abs(alone.T @ left @ alone).max() < 1e-4
     clear = np.linalg.pinv(np.vstack([known, spurious]))[:, :3]
     np.testing.assert_allclose(clear.T @ left @ clear, 100.0 * np.eye(3), rtol=0.05, atol=2.0)
+
+
+@pytest.mark.parametrize("d", [MANY - 1, MANY + 61])
+def test_many_unknowns_are_judged_as_few_are(d: int) -> None:
+    """By Lanczos' and by Cholesky's methods the same comes out as by all eigenvalues."""
+    rng = np.random.default_rng(d)
+    X, Y = rng.normal(size=(d, d)), rng.normal(size=(d, 40))
+    whole, part = X @ X.T + 0.1 * d * np.eye(d), Y @ Y.T
+    expected = eigh(part, whole, eigvals_only=True)[-1]
+    assert_allclose(largest_share(part, whole), expected, rtol=1e-10)
+    assert largest_share(0.0 * part, whole) == pytest.approx(0.0, abs=1e-12)
+    assert np.array_equal(firm(whole), whole)
+    # what nothing holds is still found, and held
+    assert np.linalg.eigvalsh(part)[0] < 1e-9 < np.linalg.eigvalsh(firm(part))[0]

@@ -18,7 +18,7 @@ import pytest
 
 from depthba import cli
 from depthba.dataset import Dataset
-from depthba.errors import OptionError
+from depthba.errors import DepthbaError, OptionError
 from depthba.trajectory import read_tum
 from eval.benchmark import outcome, plan, report, runner, summary, tables
 from eval.benchmark.outcome import Outcome
@@ -108,6 +108,20 @@ def test_what_is_done_is_not_run_again(
     }
     changed = {m for m, f in files.items() if f.stat().st_mtime_ns != stamps[m]}
     assert changed == {ODD + "Knows"}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_what_a_full_disk_ends_is_no_result(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    filled = run(job(dataset, tmp_path, "Fills"))["Fills"]
+    assert filled.status == "done", filled.reason
+    work = job(dataset, tmp_path, "Knows", "FullForGood")
+    with pytest.raises(DepthbaError, match="FullForGood: No space left on device"):
+        run(work)
+    assert not runner.needed(work, ODD + "Knows") and runner.needed(work, ODD + "FullForGood")
+    assert not list(work.folder(ODD + "FullForGood").iterdir())
 
 
 def test_a_killed_benchmark_goes_on_and_leaves_no_process(dataset: Path, tmp_path: Path) -> None:

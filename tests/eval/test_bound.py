@@ -20,6 +20,7 @@ from depthba.run_folder import RunFolder
 from eval.bound import Bound, bound
 from eval.evaluate import evaluate
 from eval.metrics import pose_metrics
+from sim.scenes import SCENES, find_scene
 from tests.depthba.analytic_scene import bumpy, cameras, ray_cast, truth_of, write_scene
 
 SHARED = Path(__file__).parents[3] / "shared"
@@ -78,11 +79,14 @@ def test_noisy_frames_tell_the_same_as_clean_ones(tmp_path: Path) -> None:
     )
 
 
-def test_a_simulated_dataset_is_rendered_anew(tmp_path: Path) -> None:
+def test_a_simulated_dataset_is_rendered_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCENES, "heap", find_scene("tests.sim.heaps:heap"))
     options = sim.GenerateOptions(
         frames=4, size=(80, 60), rig="gantry", sensor="sp1000", white=True, rgb=False
     )
-    dataset = Dataset.open(sim.generate("tests.sim.heaps:heap", tmp_path / "set", options))
+    dataset = Dataset.open(sim.generate("heap", tmp_path / "set", options))
     assert bound(dataset, 0.08).surface == "clean"
 
 
