@@ -14,7 +14,7 @@ from depthba import __version__
 from depthba.camera import Camera
 from depthba.convert import files, overlap, registry
 from depthba.convert.reading import Reading
-from depthba.convert.recording import Recording, SourceFrame
+from depthba.convert.recording import Recording, SourceFrame, count
 from depthba.dataset import Dataset, DatasetWriter
 from depthba.dataset.sensor import DEPTH_LARGEST
 from depthba.errors import DatasetError, OptionError
@@ -105,10 +105,15 @@ def into_dataset(
     }
     writer = DatasetWriter.create(path, header)
     poses = recording.T_world_camera
+    blind = []
     for k, frame in enumerate(recording.frames):
         depth = _depth(frame, recording.path)
         cloud = frame.cloud() if frame.cloud is not None else None
         rgb = None
+        if not (
+            np.isfinite(depth).any() if depth is not None else cloud is not None and len(cloud)
+        ):
+            blind.append(frame.name)
         if depth is not None and as_clouds:
             assert frame.camera is not None
             cloud = frame.camera.backproject(depth)
@@ -128,6 +133,13 @@ def into_dataset(
             raise DatasetError(f"{recording.path}: {frame.name}: {error}") from error
         if progress is not None:
             progress(k + 1, len(recording.frames))
+    if len(blind) == len(recording.frames):
+        raise DatasetError(
+            f"{recording.path}: nothing was measured in any frame ({blind[0]} and all others are "
+            "empty), expected depth above 0"
+        )
+    if blind:
+        notes.append(f"nothing was measured in {count(len(blind), 'frame')} ({blind[0]}, …)")
     return Imported(Dataset.open(path), recording.format, tuple(notes))
 
 
