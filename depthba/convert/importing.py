@@ -139,7 +139,8 @@ def into_dataset(
             "empty), expected depth above 0"
         )
     if blind:
-        notes.append(f"nothing was measured in {count(len(blind), 'frame')} ({blind[0]}, …)")
+        names = ", ".join(blind[:3]) + (", …" if len(blind) > 3 else "")
+        notes.append(f"nothing was measured in {count(len(blind), 'frame')} ({names})")
     return Imported(Dataset.open(path), recording.format, tuple(notes))
 
 

@@ -76,7 +76,9 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
             f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
             f"expected {_options(declared, verdict.best, recording)}, or --unchecked"
         )
-    notes = (f"frames agree in {verdict.share:.0%} of their points with {declared}",)
+    notes: tuple[str, ...] = (
+        f"frames agree in {verdict.share:.0%} of their points with {declared}",
+    )
     if verdict.share < 0.1:
         notes = (
             f"{notes[0]}, which is little, but no other convention does better: "
