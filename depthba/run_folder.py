@@ -354,7 +354,9 @@ def read_result(path: Path) -> dict[str, Any]:
     try:
         result = parse_json(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RunError(f"{file}: missing, expected a folder that register finished") from None
+        raise RunError(
+            f"{file}: missing, expected a run, as `depthba register DATASET --out RUN` leaves it"
+        ) from None
     except (OSError, ValueError) as error:
         raise RunError(f"{file}: not readable: {error}") from error
     if not isinstance(result, dict) or result.get("format") != "depthba-run":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -79,13 +80,18 @@ def listed(folder: Path, suffixes: Sequence[str], pattern: str = "*") -> list[Pa
 def text(path: Path) -> str:
     """Return a text file."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        data = path.read_bytes()
+        # Windows' shells write UTF-16 with a mark
+        marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        return data.decode("utf-16" if marked else "utf-8-sig")
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file") from None
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror}, expected a readable file") from error
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
+        raise DatasetError(
+            f"{path}: byte {error.start} is not {error.encoding.upper()}, expected text"
+        ) from error
 
 
 def json_object(path: Path) -> dict[str, Any]:
@@ -150,6 +156,14 @@ def colour_image(path: Path) -> Callable[[], NDArray[np.uint8]]:
     return partial(_load_colour, path)
 
 
+def colour_of(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Return the colour (height, width, 3), RGB, of a packed image. ``name`` is for the error."""
+    import cv2
+
+    image = decoded(data, cv2.IMREAD_COLOR, name, "a colour image")
+    return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Return the width and height of an image, pixels."""
     pixels = _pixels(path)
@@ -159,10 +173,17 @@ def image_size(path: Path) -> tuple[int, int]:
 def _load_depth(path: Path, scale: float, invalid: tuple[int, ...], floats: bool) -> Array:
     pixels = _pixels(path)
     if pixels.ndim != 2:
-        raise DatasetError(f"{path}: {pixels.shape[2:]} channels, expected one of depth")
+        raise DatasetError(
+            f"{path}: a picture of {pixels.shape[2]} channels of {pixels.dtype}, expected depth: "
+            "one channel of 16 bits. Colour belongs into rgb/"
+        )
     if pixels.dtype not in (np.uint16, np.uint32) and not (floats and pixels.dtype.kind == "f"):
         kinds = "16-bit" + (" or floating-point" if floats else "")
-        raise DatasetError(f"{path}: pixels of type {pixels.dtype}, expected {kinds} depth")
+        lost = ": 8 bits hold a picture of it, export the depth itself"
+        raise DatasetError(
+            f"{path}: pixels of type {pixels.dtype}, expected {kinds} depth"
+            f"{lost if pixels.dtype == np.uint8 else ''}"
+        )
     gone = pixels <= 0
     if pixels.dtype.kind == "f":
         gone |= ~np.isfinite(pixels)
@@ -175,10 +196,7 @@ def _load_depth(path: Path, scale: float, invalid: tuple[int, ...], floats: bool
 
 
 def _load_colour(path: Path) -> NDArray[np.uint8]:
-    import cv2
-
-    image = _decoded(path, cv2.IMREAD_COLOR, "a colour image")
-    return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
+    return colour_of(_bytes(path), str(path))
 
 
 def _pixels(path: Path) -> NDArray[Any]:
@@ -194,21 +212,28 @@ def _pixels(path: Path) -> NDArray[Any]:
         except ValueError as error:
             raise DatasetError(f"{path}: {error}, expected an array of depth") from error
         return array
-    return _decoded(path, cv2.IMREAD_UNCHANGED, "a depth image")
+    return decoded(_bytes(path), cv2.IMREAD_UNCHANGED, str(path), "a depth image")
 
 
-def _decoded(path: Path, how: int, what: str) -> NDArray[Any]:
-    """Return the pixels of an image whose head was looked at before."""
+def decoded(data: bytes, how: int, name: str, what: str) -> NDArray[Any]:
+    """Return the pixels of a packed image whose head was looked at before.
+
+    Args:
+        data: the file's bytes.
+        how: a flag of `cv2.imdecode`.
+        name: of the file, for the `DatasetError`.
+        what: what is expected, for the `DatasetError`.
+
+    """
     import cv2
 
-    data = _bytes(path)
     try:
         bounds.check_image(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except (ValueError, cv2.error) as error:
-        raise DatasetError(f"{path}: {error}, expected {what}") from error
+        raise DatasetError(f"{name}: {error}, expected {what}") from error
     if image is None:
-        raise DatasetError(f"{path}: cannot be decoded, expected {what}")
+        raise DatasetError(f"{name}: cannot be decoded, expected {what}")
     return np.asarray(image)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from depthba import __version__
 from depthba.convert import files, overlap, registry
 from depthba.convert.reading import Reading
-from depthba.convert.recording import Recording, SourceFrame
+from depthba.convert.recording import Recording, SourceFrame, count
 from depthba.dataset import Dataset, DatasetWriter, is_dataset
 from depthba.dataset.sensor import DEPTH_LARGEST
 from depthba.errors import DatasetError, OptionError
@@ -101,10 +101,15 @@ def into_dataset(
     }
     writer = DatasetWriter.create(path, header)
     poses = recording.T_world_camera
+    blind = []
     for k, frame in enumerate(recording.frames):
         depth = _depth(frame, recording.path)
         cloud = frame.cloud() if frame.cloud is not None else None
         rgb = None
+        if not (
+            np.isfinite(depth).any() if depth is not None else cloud is not None and len(cloud)
+        ):
+            blind.append(frame.name)
         if depth is not None and as_clouds:
             assert frame.camera is not None
             cloud = frame.camera.backproject(depth)
@@ -124,6 +129,14 @@ def into_dataset(
             raise DatasetError(f"{recording.path}: {frame.name}: {error}") from error
         if progress is not None:
             progress(k + 1, len(recording.frames))
+    if len(blind) == len(recording.frames):
+        raise DatasetError(
+            f"{recording.path}: nothing was measured in any frame ({blind[0]} and all others are "
+            "empty), expected depth above 0"
+        )
+    if blind:
+        names = ", ".join(blind[:3]) + (", …" if len(blind) > 3 else "")
+        notes.append(f"nothing was measured in {count(len(blind), 'frame')} ({names})")
     return Imported(Dataset.open(path), recording.format, tuple(notes))
 
 

@@ -34,23 +34,29 @@ def camera_of(
     width, height = files.image_size(first)
     distortion = reading.distortion or (0.0,) * 5
     if reading.intrinsics is not None:
-        return made(width, height, reading.intrinsics, distortion, "--intrinsics")
+        camera = made(width, height, reading.intrinsics, distortion, "--intrinsics")
+        if not (0 <= camera.cx < width and 0 <= camera.cy < height) and not reading.unchecked:
+            raise DatasetError(
+                f"--intrinsics: cx {camera.cx:g}, cy {camera.cy:g} lies outside of images of "
+                f"{width} x {height} pixels: expected fx fy cx cy for this size, or --unchecked"
+            )
+        return camera
     beside = next((path / name for name in NAMES if (path / name).is_file()), None)
-    camera = read_open3d(beside) if beside is not None else published
-    if camera is None:
+    known = read_open3d(beside) if beside is not None else published
+    if known is None:
         raise DatasetError(
             f"{path}: {why or 'does not say the intrinsics'}, expected --intrinsics FX FY CX CY, "
             f"or {NAMES[1]} as Open3D writes it"
         )
-    if (camera.width, camera.height) != (width, height):
+    if (known.width, known.height) != (width, height):
         whose = beside or "the format's description"
         raise DatasetError(
-            f"{first}: {width} x {height} pixels, but {whose} is for {camera.width} x "
-            f"{camera.height}: expected --intrinsics FX FY CX CY"
+            f"{first}: {width} x {height} pixels, but {whose} is for {known.width} x "
+            f"{known.height}: expected --intrinsics FX FY CX CY"
         )
     if reading.distortion is not None:
-        return made(width, height, pinhole(camera), distortion, "--distortion")
-    return camera
+        return made(width, height, pinhole(known), distortion, "--distortion")
+    return known
 
 
 def pinhole(camera: Camera) -> tuple[float, float, float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.convert.reading import Axes, Direction
+from depthba.convert.reading import Axes, Direction, Quaternions
 from depthba.convert.recording import Convention, Recording
 from depthba.errors import DatasetError
 
@@ -36,6 +36,8 @@ LEAST_SHIFT = 0.01
 GOOD, BETTER = 0.3, 0.2
 """Another convention explains the frames when that part of the points agrees, and it is that much
 more, and at least twice as many."""
+ENOUGH, NOTICEABLE = 0.7, 0.1
+"""Below the one, other units are looked at; by the other more of the points is worth a word."""
 AS_GOOD = 0.8
 """With that part of the declared convention's share, another is as good."""
 
@@ -51,6 +53,10 @@ class Verdict:
     best_share: float
     as_good: tuple[Convention, ...] = ()
     """Others that the overlap cannot tell from the declared one."""
+    reach: float = float("nan")
+    """Typical distance of the points from their camera, m."""
+    rescaled: tuple[Convention, float] | None = None
+    """One of other units that explains more of the points, though not clearly, and its share."""
 
 
 def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
@@ -70,7 +76,9 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
             f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
             f"expected {_options(declared, verdict.best, recording)}, or --unchecked"
         )
-    notes = (f"frames agree in {verdict.share:.0%} of their points with {declared}",)
+    notes: tuple[str, ...] = (
+        f"frames agree in {verdict.share:.0%} of their points with {declared}",
+    )
     if verdict.share < 0.1:
         notes = (
             f"{notes[0]}, which is little, but no other convention does better: "
@@ -79,7 +87,15 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
     if verdict.as_good:
         others = ", or ".join(map(str, verdict.as_good))
         notes = (f"{notes[0]}; the overlap cannot tell that from {others}",)
-    return verdict, notes
+    if verdict.rescaled is not None:
+        other, found = verdict.rescaled
+        options = _options(declared, other, recording)
+        notes += (f"with {options} they would agree in {found:.0%}: are the units right?",)
+    span = float(np.linalg.norm(np.ptp(recording.T_world_camera[:, :3, 3], axis=0)))
+    return verdict, (
+        *notes,
+        f"points lie about {verdict.reach:.3g} m from the cameras, whose places span {span:.3g} m",
+    )
 
 
 def judge(recording: Recording) -> Verdict:
@@ -95,12 +111,14 @@ def judge(recording: Recording) -> Verdict:
     if share < 0.5 and max(others.values()) <= least:  # above, none could agree in twice as many
         others = {
             c: _share(pairs, recording.poses, c)
-            for c in _others(declared, FACTORS)
+            for c in (*_others(declared, FACTORS), *_reordered(declared))
             if _moves(pairs, recording.poses, c)
         }
     best = max(others, key=lambda c: others[c], default=declared)
     if best == declared or others[best] <= least:
-        return Verdict(share, declared, share, as_good)
+        reach = float(np.median([pair.reach for pair in pairs]))
+        rescaled = _rescaled(pairs, recording.poses, declared, share) if share < ENOUGH else None
+        return Verdict(share, declared, share, as_good, reach, rescaled)
     return Verdict(share, best, others[best])
 
 
@@ -161,6 +179,16 @@ def _share(pairs: list[_Pair], poses: Array, convention: Convention) -> float:
     return float(np.mean(list(shares.values())))
 
 
+def _rescaled(
+    pairs: list[_Pair], poses: Array, declared: Convention, share: float
+) -> tuple[Convention, float] | None:
+    """Return the convention of other units that does noticeably better, and its share."""
+    others = [replace(declared, scale=declared.scale * factor) for factor in FACTORS]
+    found = {c: _share(pairs, poses, c) for c in others if _moves(pairs, poses, c)}
+    best = max(found, key=lambda c: found[c], default=declared)
+    return (best, found[best]) if found and found[best] > share + NOTICEABLE else None
+
+
 def _moves(pairs: list[_Pair], poses: Array, convention: Convention) -> bool:
     """Tell whether the camera moves noticeably, though not beyond what it sees."""
     shifts = []
@@ -179,12 +207,21 @@ def _others(declared: Convention, factors: tuple[float, ...]) -> Iterator[Conven
             yield other
 
 
+def _reordered(declared: Convention) -> Iterator[Convention]:
+    """Give conventions under which the file has its quaternions in the other order."""
+    order: Quaternions = "wxyz" if declared.quaternions == "xyzw" else "xyzw"
+    other = replace(declared, quaternions=order)
+    yield from (other, *_others(other, (1.0,)))
+
+
 def _options(declared: Convention, best: Convention, recording: Recording) -> str:
     words = []
     if best.axes != declared.axes:
         words.append(f"--axes {best.axes}")
     if best.direction != declared.direction:
         words.append(f"--direction {best.direction}")
+    if best.quaternions != declared.quaternions:
+        words.append(f"--quaternions {best.quaternions}")
     if best.scale != declared.scale:
         words.append(f"--pose-scale {best.scale:g}")
         if recording.depth_scale is not None:

@@ -61,9 +61,15 @@ def by_order(names: Sequence[str], poses: Poses) -> Paired:
     if len(names) != len(poses.poses):
         raise DatasetError(
             f"{poses.path}: {len(poses.poses)} poses for {len(names)} frames ({names[0]} to "
-            f"{names[-1]}), expected one each"
+            f"{names[-1]}), expected one each, or images whose names are the stamps of their poses"
         )
     stamps = np.arange(float(len(names))) if poses.stamps is None else poses.stamps
+    values, counts = np.unique(stamps, return_counts=True)
+    if (counts > 1).any():
+        k = int(np.argmax(counts))
+        raise DatasetError(
+            f"{poses.path}: {counts[k]} poses of stamp {values[k]:.6f}, expected a stamp each"
+        )
     return [(k, float(stamps[k]), poses.poses[k]) for k in range(len(names))]
 
 
@@ -84,6 +90,8 @@ def by_name(found: Sequence[Path], poses: Poses, max_gap: float) -> tuple[Paired
         span = poses.stamps.min() - max_gap, poses.stamps.max() + max_gap
         share = float(((known >= span[0]) & (known <= span[1])).mean())
         exact = np.isin(np.rint(known * 1e6), np.rint(poses.stamps * 1e6)).mean()
+        if unit != 1.0 and any("." in _digits(p) for p in found):
+            break  # with a point they are seconds
         # 000000.png to 000099.png lie within many a span
         telling = all(len(_digits(p)) >= _STAMP_DIGITS or "." in _digits(p) for p in found)
         if (telling and share > 0.5) or (unit == 1.0 and exact == 1.0):

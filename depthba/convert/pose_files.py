@@ -75,8 +75,17 @@ def read(path: Path) -> Poses:
         return Poses(path, _matrices(path, rows), None)
     at, row = next((at, row) for at, row in rows if len(row) not in (8, 12))
     raise DatasetError(
-        f"{path}: line {at}: {len(row)} numbers, expected 8 (TUM), 12 (KITTI) or 4x4 matrices"
+        f"{path}: line {at}: {len(row)} numbers{_guess(path, at, len(row))}, expected 8 (TUM: "
+        "stamp tx ty tz qx qy qz qw), 12 (KITTI) or 4x4 matrices"
     )
+
+
+def _guess(path: Path, at: int, count: int) -> str:
+    """Return what may be wrong with a line of so many numbers."""
+    line = files.text(path).splitlines()[at - 1]
+    if "," in line and "." not in line:
+        return " between commas (decimal commas? write points)"
+    return {6: " (angles?)", 7: " (without a stamp? with angles?)"}.get(count, "")
 
 
 def looks_like_tum(path: Path) -> bool:
@@ -119,7 +128,8 @@ def _rows(path: Path, limit: int | None = None) -> list[tuple[int, list[float]]]
             if not out and at == 1:  # a head over the columns
                 continue
             raise DatasetError(
-                f"{path}: line {at}: {line[:60]!r}, expected numbers of poses"
+                f"{path}: line {at}: {line[:60]!r}, expected numbers of poses with decimal points, "
+                "such as stamp tx ty tz qx qy qz qw (TUM)"
             ) from None
         if len(out) == limit:
             break

@@ -7,6 +7,7 @@ from typing import Literal
 
 Axes = Literal["opencv", "opengl"]
 Direction = Literal["camera-to-world", "world-to-camera"]
+Quaternions = Literal["xyzw", "wxyz"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Reading:
     """Axes of the camera. opencv: x right, y down, z forward. opengl: x right, y up, z back."""
     direction: Direction | None = None
     """Which way the poses map."""
+    quaternions: Quaternions | None = None
+    """Order of the quaternions in a file of poses. None: xyzw, as TUM has it."""
     pose_scale: float | None = None
     """Metres per unit of the poses' translations, such as 0.001 where they are in mm."""
     cloud_scale: float | None = None

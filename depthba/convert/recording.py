@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from depthba import se3
 from depthba.camera import Camera
-from depthba.convert.reading import Axes, Direction, Reading
+from depthba.convert.reading import Axes, Direction, Quaternions, Reading
 from depthba.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -34,10 +34,14 @@ class Convention:
     direction: Direction = "camera-to-world"
     scale: float = 1.0
     """Metres per unit of translations."""
+    quaternions: Quaternions = "xyzw"
+    """Order in which the file has them; its poses were read as xyzw."""
 
     def applied(self, poses: Array) -> Array:
         """Return T_world_camera (N, 4, 4), m, OpenCV's axes, of poses (N, 4, 4) as in the file."""
         T = poses.copy()
+        if self.quaternions == "wxyz":
+            T = se3.from_quaternion(T[:, :3, 3], np.roll(se3.quaternion(T), -1, axis=-1))
         T[:, :3, 3] *= self.scale
         if self.direction == "world-to-camera":
             T = se3.inverse(T)
@@ -49,6 +53,8 @@ class Convention:
         if self.direction == "world-to-camera":
             T = se3.inverse(T)
         T[:, :3, 3] /= self.scale
+        if self.quaternions == "wxyz":
+            T = se3.from_quaternion(T[:, :3, 3], np.roll(se3.quaternion(T), 1, axis=-1))
         return T
 
     def asked(self, reading: Reading) -> Convention:
@@ -57,12 +63,14 @@ class Convention:
             axes=reading.axes or self.axes,
             direction=reading.direction or self.direction,
             scale=reading.pose_scale or self.scale,
+            quaternions=reading.quaternions or self.quaternions,
         )
 
     def __str__(self) -> str:
         """Return the convention in a few words."""
         scale = "" if self.scale == 1.0 else f", {self.scale:g} m per unit"
-        return f"{self.axes} axes, {self.direction}{scale}"
+        order = "" if self.quaternions == "xyzw" else ", quaternions wxyz"
+        return f"{self.axes} axes, {self.direction}{scale}{order}"
 
 
 @dataclass(frozen=True, eq=False)

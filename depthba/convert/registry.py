@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+from depthba.convert import files
 from depthba.convert.recording import Format
 from depthba.errors import DatasetError, OptionError
 
@@ -16,6 +17,7 @@ _MODULES = (
     "nerfstudio",
     "bop",
     "scannet",
+    "sens",
     "kitti",
     "colmap",
     "bags",
@@ -58,7 +60,33 @@ def recognise(path: Path) -> Format:
         could = " or ".join(f"{f.name} ({told})" for f, told in specific)
         raise DatasetError(f"{path}: could be {could}: say which with --kind")
     choices = ", ".join(f.name for f in _formats() if f.read is not None)
-    raise DatasetError(f"{path}: nothing in it is known, expected a dataset or one of: {choices}")
+    raise DatasetError(
+        f"{path}: {_unknown(path)}, expected a dataset or one of: {choices} (`depthba convert "
+        "--list` says what lies in each)"
+    )
+
+
+def _unknown(path: Path) -> str:
+    """Say what is there in place of a known source, and what it may have been meant as."""
+    if path.is_file():
+        return f"a file of no known kind ({path.suffix or 'without a suffix'})"
+    try:
+        there = sorted(path.iterdir())
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    if not there:
+        return "an empty folder"
+    for folder in (p for p in there if p.is_dir()):
+        if images := files.listed(folder, files.DEPTH_SUFFIXES):
+            return (
+                f"nothing in it is known, but {folder.name}/{images[0].name} is an image: depth "
+                "images lie in the folder itself or in depth/"
+            )
+    for folder in (path / "depth", path):
+        if images := files.listed(folder, files.COLOUR_SUFFIXES):
+            return f"nothing in it is known: {images[0].name} is of a kind that holds no depth"
+    names = ", ".join(p.name for p in there[:3]) + (", …" if len(there) > 3 else "")
+    return f"nothing in it is known ({names})"
 
 
 def _formats() -> Iterator[Format]:

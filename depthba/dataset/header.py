@@ -101,7 +101,9 @@ def _header_text(root: Path) -> str:
     except OSError as error:
         raise DatasetError(f"{root}: {error.strerror}, expected a readable folder") from error
     if FILE not in entries:
-        raise DatasetError(f"{root}: no {FILE} in it, expected a dataset")
+        raise DatasetError(
+            f"{root}: no {FILE} in it, expected a dataset; `depthba convert` makes one"
+        )
     for name in sorted(entries):
         if name in _READ or name.startswith("poses_"):
             try:

@@ -5,16 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from depthba import trajectory
 from depthba.dataset.listing import pose_file
 from depthba.dataset.writing import DatasetWriter
+from depthba.errors import DatasetError
 
 if TYPE_CHECKING:
     from depthba.dataset.reading import Dataset
 
 
 def save(dataset: Dataset, path: Path) -> Dataset:
-    """Write the frames of a dataset with all that is known of them into a new folder."""
+    """Write the frames of a dataset with all that is known of them into a new folder.
+
+    Raises:
+        DatasetError: crops and masks leave nothing; or see `DatasetWriter`.
+
+    """
     header = {**dataset.header, "name": dataset.name, "map_frame": dataset.map_frame}
     header["sensor"] = dict(header["sensor"])
     scale = min((frame.sensor.depth_scale or 0.0 for frame in dataset), default=0.0)
@@ -27,17 +35,28 @@ def save(dataset: Dataset, path: Path) -> Dataset:
                 header["sensor"] |= {} if value is None else {bound: value}
     writer = DatasetWriter.create(path, header)
     truth = dataset.T_world_camera_true
+    left = False
     for row, frame in enumerate(dataset):
         depth = frame.sensor.kind == "depth"
+        z = frame.depth() if depth else None
+        cloud = None if depth else frame.points()
+        left |= (
+            bool(np.isfinite(z).any()) if z is not None else bool(cloud is not None and len(cloud))
+        )
         writer.add_frame(
             stamp=frame.stamp,
             T_world_camera=frame.T_world_camera,
-            depth=frame.depth() if depth else None,
-            cloud=None if depth else frame.points(),
+            depth=z,
+            cloud=cloud,
             rgb=frame.rgb() if depth else None,
             T_world_camera_true=None if truth is None else truth[row],
             joints=frame.joints,
             T_base_flange=frame.T_base_flange,
+        )
+    if not left and any(frame.cuts for frame in dataset):
+        raise DatasetError(
+            f"{dataset.path}: the crop or the mask leaves nothing, expected ranges in metres in "
+            "which there are points: a region of interest in the map frame, depth from the camera"
         )
     stored = {frame.id: new for frame, new in zip(dataset, writer.ids, strict=True)}
     if markers := dataset.markers():

@@ -17,6 +17,9 @@ from depthba.optimiser.asking import look
 from depthba.optimiser.waves import Waves, waves_of
 
 Roi = tuple[float, float, float, float, float, float]
+_CUT = (
+    " that its crop and its mask leave: expected --depth-range in metres, and a mask that is not 0"
+)
 
 # Blocks of the image (columns, rows) over which residuals are taken to be correlated.
 BLOCKS = (8, 6)
@@ -111,15 +114,22 @@ def prepare(dataset: Dataset, T_world_camera: NDArray[np.float64], roi: Roi | No
         )
     clouds = [points_of(frame) for frame in dataset]
     if not any(len(p) for p in clouds):
-        raise DatasetError(f"{dataset.path}: no frame has a single valid depth")
+        raise DatasetError(
+            f"{dataset.path}: no frame has a single valid depth"
+            f"{_CUT if any(frame.cuts for frame in dataset) else ''}"
+        )
     clouds, refused = without_repeats(clouds, dataset.ids)
     T_map_world = choose_map_frame(dataset.map_frame, clouds, T_world_camera)
     T_map_camera = T_map_world @ T_world_camera
     if roi is not None:
         check_roi(roi)
-        clouds = [crop(p, T, roi) for p, T in zip(clouds, T_map_camera, strict=True)]
+        whole, clouds = clouds, [crop(p, T, roi) for p, T in zip(clouds, T_map_camera, strict=True)]
         if not any(len(p) for p in clouds):
-            raise OptionError(f"--roi {' '.join(f'{v:g}' for v in roi)}: no point lies inside it")
+            raise OptionError(
+                f"--roi {' '.join(f'{v:g}' for v in roi)}: no point lies inside it, expected xmin "
+                "xmax ymin ymax zmin zmax of the map frame, m: "
+                f"the points lie in {_extent(whole, T_map_camera)}"
+            )
     if sum(len(p) > 0 for p in clouds) < 2:
         seen = [f.id for f, p in zip(dataset, clouds, strict=True) if len(p)]
         why = f" ({next(filter(None, refused))})" if any(refused) else ""
@@ -246,6 +256,15 @@ def check_roi(roi: Roi) -> None:
                 f"--roi: {axis}min {low:g} is not below {axis}max {high:g} "
                 "(expected xmin xmax ymin ymax zmin zmax)"
             )
+
+
+def _extent(clouds: Sequence[NDArray[np.float32]], T_map_camera: NDArray[np.float64]) -> str:
+    """Return the bounds of all points in the map frame, as a region of interest has them."""
+    points = np.concatenate(
+        [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(clouds, T_map_camera, strict=True)]
+    )
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)], axis=1).ravel()
+    return " ".join(f"{v:.3g}" for v in bounds)
 
 
 def crop(points: NDArray[np.float32], T: NDArray[np.float64], roi: Roi) -> NDArray[np.float32]:

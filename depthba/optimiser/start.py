@@ -34,7 +34,9 @@ def start_poses(dataset: Dataset, options: Options) -> NDArray[np.float64]:
         sigma_t, sigma_r = pose_sigmas(dataset.pose_noise, options)
         return dataset_poses(dataset, sigma_t, sigma_r, options.threads).T_world_camera
     if not Path(init).is_file():
-        raise OptionError(f"--init {init}: expected measured, identity, pairwise or a file")
+        raise OptionError(
+            f"--init {init}: expected measured, identity, pairwise or a file of poses that is there"
+        )
     stamps, poses = read_tum(init)[:2]
     found = []
     for frame in dataset:

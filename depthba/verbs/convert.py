@@ -59,9 +59,9 @@ class Arguments:
     """Convert data of other formats into a dataset, or a dataset or a run into other formats.
 
     SRC is recognised by its content: a dataset or a run of depthba, TUM RGB-D, 7-Scenes, Redwood,
-    nerfstudio, BOP, ScanNet, KITTI, ROS bags, MCAP, folders of clouds or of depth images. DST is a
-    new folder, or a file whose suffix says what of the result is wanted, such as poses.g2o,
-    cloud.las, map.tif, map.glb.
+    nerfstudio, BOP, ScanNet (folders and .sens), KITTI, ROS bags, MCAP, folders of clouds or of
+    depth images. DST is a new folder, or a file whose suffix says what of the result is wanted,
+    such as poses.g2o, cloud.las, map.tif, map.glb.
     """
 
     src: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")] = None

@@ -58,7 +58,8 @@ def _dataset(path: Path, json: bool) -> int:
         else:
             for fault in faults:
                 frame = "" if fault.frame is None else f", frame {fault.frame}"
-                print(f"{fault.file}{frame}: {fault.text}")
+                where = f"{fault.file}{frame}"
+                print(f"{where}: {fault.text}" if where else fault.text)
             print(f"{path}: {len(faults)} fault{'s' if len(faults) > 1 else ''}")
         return KNOWN_ERROR
     dataset = Dataset.open(path)

@@ -58,6 +58,12 @@ def test_no_page_fetches_anything_from_elsewhere(site: Path) -> None:
         assert not re.search(r"(url\(|@import)\s*[\"']?(https?:)?//", sheet.read_text()), sheet
 
 
+def test_every_page_is_in_the_menu(site: Path) -> None:
+    menu = (site / "index.html").read_text(encoding="utf-8")
+    for page in ROOT.glob("docs/*.md"):
+        assert page.stem == "index" or f'href="{page.stem}.html"' in menu, page.name
+
+
 def test_formulas_are_mathml_without_what_was_not_understood(site: Path) -> None:
     text = (site / "theory.html").read_text(encoding="utf-8")
     formulas = re.findall(r"<math .*?</math>", text, re.DOTALL)

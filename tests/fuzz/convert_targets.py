@@ -97,6 +97,13 @@ def _bags(name: str, writer: str, source: str, file: str, mutate: Mutator) -> Ta
     return Target(f"convert-{name}", make, file, partial(_read_bag, source), mutate)
 
 
+def _sens(path: Path) -> None:
+    from tests.depthba.convert import sens_file
+
+    path.mkdir()
+    sens_file.write(path / "scan.sens", sens_file.ZLIB)
+
+
 def _text_ply(path: Path) -> None:
     from depthba import trajectory
 
@@ -141,6 +148,7 @@ TARGETS = (
     _convert("nerfstudio", "nerfstudio", "transforms.json", _json),
     _convert("bop", "bop", "scene_camera.json", _json),
     _convert("scannet-intrinsics", "scannet", "intrinsic/intrinsic_depth.txt", _text),
+    Target("convert-sens", _sens, "scan.sens", partial(read, kind="sens"), _any),
     _convert("kitti-calib", "kitti", "calib.txt", _text),
     _convert("kitti-times", "kitti", "times.txt", _text),
     _convert("kitti-poses", "kitti", "poses.txt", _text),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.camera import Camera
-from depthba.convert import intrinsics
+from depthba.convert import files, intrinsics
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -28,8 +28,23 @@ def encoding(message: Any) -> str:
     """Return the encoding of an image, compressed or not; "" where it is not of depth."""
     if hasattr(message, "encoding"):
         return str(message.encoding) if message.encoding in _DTYPES else ""
-    words = str(message.format).replace(";", " ").split()
+    words = _words(message)
+    if words[:1] == ["16UC1"] and "png" in words:
+        return "16UC1"
     return words[0] if "compressedDepth" in words and words[0] in UNITS else ""
+
+
+def is_colour(message: Any) -> bool:
+    """Tell whether an image, packed or not, is of colour."""
+    if hasattr(message, "encoding"):
+        return message.encoding in _COLOURS
+    words = _words(message)
+    return not encoding(message) and "compressedDepth" not in words and words[:1] != ["mono8"]
+
+
+def _words(message: Any) -> list[str]:
+    """Return what the format of a packed image says, such as rgb8, jpeg, compressed."""
+    return str(message.format).replace(";", " ").split()
 
 
 def decode(message: Any, unit: float, name: str) -> Array:
@@ -46,7 +61,8 @@ def decode(message: Any, unit: float, name: str) -> Array:
         told = getattr(message, "encoding", getattr(message, "format", ""))
         raise DatasetError(f"{name}: encoding {told!r}, expected 16UC1 or 32FC1 of depth")
     if not hasattr(message, "encoding"):
-        z = _compressed(bytes(message.data), kind, name)
+        head = _HEAD if "compressedDepth" in _words(message) else 0
+        z = _compressed(bytes(message.data), head, kind, name)
     else:
         order = ">" if message.is_bigendian else "<"
         z = _pixels(message, np.dtype(order + _DTYPES[kind]), 1, name)[..., 0].astype(np.float64)
@@ -56,12 +72,7 @@ def decode(message: Any, unit: float, name: str) -> Array:
 def colour(message: Any, name: str) -> NDArray[np.uint8]:
     """Return colour (height, width, 3), RGB."""
     if not hasattr(message, "encoding"):
-        import cv2
-
-        image = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise DatasetError(f"{name}: cannot be decoded, expected a colour image")
-        return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
+        return files.colour_of(bytes(message.data), name)
     if message.encoding not in _COLOURS:
         raise DatasetError(f"{name}: encoding {message.encoding!r}, expected rgb8 or bgr8")
     channels, order = _COLOURS[message.encoding]
@@ -114,13 +125,14 @@ def _pixels(message: Any, dtype: np.dtype[Any], channels: int, name: str) -> NDA
     return np.ascontiguousarray(rows).view(dtype).reshape(message.height, message.width, channels)
 
 
-def _compressed(data: bytes, kind: str, name: str) -> Array:
-    """Unpack compressedDepth; floating-point depth comes as a / (pixel - b)."""
+def _compressed(data: bytes, head: int, kind: str, name: str) -> Array:
+    """Unpack depth behind a head; floating-point depth comes as a / (pixel - b)."""
     import cv2
 
-    pixels = cv2.imdecode(np.frombuffer(data[_HEAD:], np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.ndim != 2:
-        raise DatasetError(f"{name}: cannot be decoded, expected a PNG behind {_HEAD} bytes")
+    what = f"a PNG behind {head} bytes"
+    pixels = files.decoded(data[head:], cv2.IMREAD_UNCHANGED, name, what)
+    if pixels.ndim != 2 or pixels.dtype != np.uint16:
+        raise DatasetError(f"{name}: {pixels.dtype} of shape {pixels.shape}, expected 16-bit depth")
     z = np.asarray(pixels, dtype=np.float64)
     if kind == "16UC1":
         return z

@@ -186,15 +186,16 @@ def _colours(
     """Return stamp, topic and time of colour images aligned to depth: of its size and its place."""
     found = []
     for topic, kind in store.topics.items():
-        if kind != IMAGES[0] or topic == depth or _realsense(topic, "Color"):
+        if kind not in IMAGES or topic == depth or _realsense(topic, "Color"):
             continue
-        for _, time, message in store.messages([topic]):
-            if (message.height, message.width) != shape or message.encoding not in (
-                "rgb8",
-                "bgr8",
-                "rgba8",
-                "bgra8",
-            ):
+        packed = kind != IMAGES[0]
+        for k, (_, time, message) in enumerate(store.messages([topic])):
+            if not depth_images.is_colour(message):
+                break
+            if packed:  # only its pixels say how large it is: those of the first stand for all
+                if k == 0 and depth_images.colour(message, topic).shape[:2] != shape:
+                    break
+            elif (message.height, message.width) != shape:
                 break
             found.append((tf.seconds(message.header.stamp), topic, time))
     return found

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -21,6 +23,7 @@ from tests.depthba.convert.small_scene import LENS, millimetres, poses
 typesys = pytest.importorskip("rosbags.typesys")
 T_BODY_CAMERA = se3.make(se3.exp_so3([0.1, -0.7, 1.2]), [0.02, 0.03, -0.05])
 DEPTH, INFO, COLOUR = "/camera/depth/image_raw", "/camera/depth/camera_info", "/camera/rgb/image"
+PACKED = "sensor_msgs/msg/CompressedImage"
 
 
 def types(ros1: bool) -> Any:
@@ -32,8 +35,10 @@ def types(ros1: bool) -> Any:
     return store
 
 
-def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int, Any]]:
-    """Return topic, type, time and message: poses 0.25 s around the images, as tf has them."""
+def messages(
+    store: Any, ros1: bool, encoding: str, packed: str = ""
+) -> list[tuple[str, str, int, Any]]:
+    """Return topic, type, time and message: tf around the images, which may be packed."""
     kinds = store.types
     out = []
 
@@ -61,6 +66,15 @@ def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int,
     lens = np.array([LENS[0], 0, LENS[2], 0, LENS[1], LENS[3], 0, 0, 1.0])
     names = ("D", "K", "R", "P") if ros1 else ("d", "k", "r", "p")
     values = (np.zeros(5), lens, np.eye(3).ravel(), np.insert(lens, [3, 6, 9], 0.0))
+
+    def info(stamp: float) -> Any:
+        return kinds["sensor_msgs/msg/CameraInfo"](
+            header=header(stamp, "camera_optical"), height=60, width=80,
+            distortion_model="plumb_bob", binning_x=0, binning_y=0,
+            roi=kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+            **dict(zip(names, values, strict=True)),
+        )  # fmt: skip
+
     for k, T in enumerate(poses()):
         stamp, now = 100.0 + 0.5 * k, int((100 + 0.5 * k) * 1e9)
         T_world_body = T @ se3.inverse(T_BODY_CAMERA)
@@ -69,6 +83,16 @@ def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int,
             moved = tf(stamp + before, "world", "body", T_world_body)
             out.append(("/tf", "tf2_msgs/msg/TFMessage", now + int(before * 1e9), moved))
         pixels = millimetres(T) if encoding == "16UC1" else small_scene.depth(T).astype(np.float32)
+        if packed:
+            image = packed_depth(pixels, packed)
+            image = kinds[PACKED](header(stamp, "camera_optical"), *image)
+            out.append((DEPTH, PACKED, now, image))
+            done, rgb = cv2.imencode(".png", small_scene.colour(k)[..., ::-1])
+            assert done
+            rgb = kinds[PACKED](header(stamp, "camera_optical"), "rgb8; png compressed bgr8", rgb)
+            out.append((COLOUR, PACKED, now + 1, rgb))
+            out.append((INFO, "sensor_msgs/msg/CameraInfo", now, info(stamp)))
+            continue
         image = kinds["sensor_msgs/msg/Image"](
             header(stamp, "camera_optical"), 60, 80, encoding, 0, 80 * pixels.itemsize,
             pixels.view(np.uint8).ravel(),
@@ -78,14 +102,23 @@ def messages(store: Any, ros1: bool, encoding: str) -> list[tuple[str, str, int,
             header(stamp, "camera_optical"), 60, 80, "rgb8", 0, 240, small_scene.colour(k).ravel()
         )
         out.append((COLOUR, "sensor_msgs/msg/Image", now + 1, rgb))
-        info = kinds["sensor_msgs/msg/CameraInfo"](
-            header=header(stamp, "camera_optical"), height=60, width=80,
-            distortion_model="plumb_bob", binning_x=0, binning_y=0,
-            roi=kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
-            **dict(zip(names, values, strict=True)),
-        )  # fmt: skip
-        out.append((INFO, "sensor_msgs/msg/CameraInfo", now, info))
+        out.append((INFO, "sensor_msgs/msg/CameraInfo", now, info(stamp)))
     return out
+
+
+def packed_depth(pixels: Any, how: str) -> tuple[str, Any]:
+    """Return format and data of depth as image_transport's plugins pack it."""
+    head = b""
+    if pixels.dtype == np.float32:  # in steps of 1 / z, by a and b in the head
+        a, b = 2000.0, 1.0
+        head = struct.pack("<iff", 0, a, b)
+        safe = np.where(np.isfinite(pixels), pixels, np.inf)
+        pixels = np.where(np.isfinite(pixels), np.rint(a / safe + b), 0).astype(np.uint16)
+    elif "compressedDepth" in how:
+        head = bytes(12)
+    done, image = cv2.imencode(".png", pixels)
+    assert done
+    return how, np.frombuffer(head + image.tobytes(), np.uint8)
 
 
 def ros1(path: Path) -> Path:
@@ -102,13 +135,13 @@ def ros1(path: Path) -> Path:
     return path / "some.bag"
 
 
-def ros2(path: Path, plugin: str = "SQLITE3", encoding: str = "32FC1") -> Path:
+def ros2(path: Path, plugin: str = "SQLITE3", encoding: str = "32FC1", packed: str = "") -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = types(False)
     with Writer(path / "some", version=9, storage_plugin=StoragePlugin[plugin]) as writer:
         made: dict[str, Any] = {}
-        for topic, kind, now, message in messages(store, False, encoding):
+        for topic, kind, now, message in messages(store, False, encoding, packed):
             if topic not in made:
                 made[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(made[topic], max(now, 1), store.serialize_cdr(message, kind))
@@ -170,6 +203,25 @@ def test_bags_give_poses_out_of_tf_and_depth_by_its_encoding(
         importing.read(path, Reading(depth_topic="/other"))
     with pytest.raises(DatasetError, match="'camera_optical' is not below moon in the tree of"):
         importing.read(path, Reading(fixed_frame="moon"))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "packed", "loose"),
+    [
+        ("16UC1", "16UC1; png compressed ", 1e-9),
+        ("16UC1", "16UC1; compressedDepth png", 1e-9),
+        ("32FC1", "32FC1; compressedDepth", 5e-4),  # z * z / (2 a), at 1 m
+    ],
+)
+def test_packed_images_are_unpacked(
+    encoding: str, packed: str, loose: float, tmp_path: Path
+) -> None:
+    recording = importing.read(ros2(tmp_path, "SQLITE3", encoding, packed), Reading())
+    assert_allclose(recording.T_world_camera, poses(), rtol=0, atol=1e-9)
+    frame = recording.frames[4]
+    assert frame.depth is not None and frame.rgb is not None
+    assert_allclose(frame.depth(), small_scene.depth(poses()[4]), rtol=0, atol=loose)
+    assert (frame.rgb() == small_scene.colour(4)).all()
 
 
 def test_a_realsense_recording_takes_its_poses_from_a_file(tmp_path: Path) -> None:

@@ -1,0 +1,208 @@
+"""What a newcomer gets wrong is named, with the next step; and nothing wrong passes in silence."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from depthba import cli
+from depthba.convert import Reading, importing
+from depthba.dataset import Dataset
+from depthba.errors import DatasetError
+from depthba.trajectory import write_tum
+from tests.depthba.convert import small_scene
+from tests.depthba.convert.small_scene import millimetres, poses, write_png
+
+READING = Reading(intrinsics=small_scene.LENS, depth_scale=small_scene.STEP)
+FRAMES = 4
+
+Change = Callable[[Path], object]
+
+
+def bare(path: Path) -> Path:
+    """Write a folder as the tutorial has it: depth/000000.png and poses.txt."""
+    T = poses()[:FRAMES]
+    for k, pose in enumerate(T):
+        write_png(path / "depth" / f"{k:06d}.png", millimetres(pose))
+    write_tum(path / "poses.txt", np.arange(float(FRAMES)), T)
+    return path
+
+
+def lines(change: Callable[[list[str]], list[str]], end: str = "\n", code: str = "utf-8") -> Change:
+    """Return what rewrites each line of poses.txt, given as words."""
+
+    def rewrite(path: Path) -> None:
+        rows = [line.split() for line in (path / "poses.txt").read_text().splitlines()]
+        text = end.join(" ".join(change(row)) for row in rows if row[0] != "#") + end
+        (path / "poses.txt").write_bytes(text.encode(code))
+
+    return rewrite
+
+
+def pictures(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Return what rewrites each image."""
+
+    def rewrite(path: Path) -> None:
+        for k, T in enumerate(poses()[:FRAMES]):
+            write_png(path / "depth" / f"{k:06d}.png", change(millimetres(T)))
+
+    return rewrite
+
+
+def same(row: list[str]) -> list[str]:
+    return row
+
+
+def scalar_first(row: list[str]) -> list[str]:
+    return [*row[:4], row[7], *row[4:7]]
+
+
+def stamped(path: Path) -> None:
+    for k in range(FRAMES):
+        (path / "depth" / f"{k:06d}.png").rename(path / "depth" / f"{1_700_000_000 + k}.125.png")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lines(same, "\r\n"),
+        lines(same, code="utf-8-sig"),
+        lines(same, code="utf-16"),
+        lines(lambda row: [",".join(row)]),
+        stamped,
+        lambda path: path.rename(path.with_name("a folder, with spaces")),
+    ],
+    ids=["Windows' lines", "mark", "UTF-16", "commas", "stamps of another clock", "spaces"],
+)
+def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
+    change(bare(tmp_path / "set"))
+    recording = importing.read(next(tmp_path.iterdir()), READING)
+    assert_allclose(recording.T_world_camera, poses()[:FRAMES], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lines(scalar_first), r"expected --quaternions wxyz, or --unchecked"),
+        (
+            lines(lambda r: [r[0], *(f"{1000 * float(v):.6f}" for v in r[1:4]), *r[4:]]),
+            r"expected --pose-scale 0.001 \(or --depth-scale 1\), or --unchecked",
+        ),
+        (
+            lines(lambda r: [word.replace(".", ",") for word in r]),
+            r"line 1: 16 numbers between commas \(decimal commas\? write points\), expected 8",
+        ),
+        (
+            lines(lambda r: [";".join(r)]),
+            r"line 2: '1.0.*', expected numbers of poses with decimal",
+        ),
+        (lines(lambda r: r[1:]), r"7 numbers \(without a stamp\? with angles\?\), expected 8"),
+        (lines(lambda r: ["5.0", *r[1:]]), r"poses.txt: 4 poses of stamp 5.000000, expected a"),
+        (lambda p: (p / "poses.txt").unlink(), r"files of poses in it: none, .*or --poses FILE"),
+        (
+            lambda p: shutil.copy(p / "poses.txt", p / "truth.txt"),
+            r"poses.txt, truth.txt, expected one .* or --poses FILE",
+        ),
+        (
+            lambda p: shutil.copy(p / "depth/000003.png", p / "depth/000004.png"),
+            r"4 poses for 5 frames \(000000.png to 000004.png\), expected one each, or images",
+        ),
+        (pictures(lambda z: (z / 8).astype(np.uint8)), r"type uint8, .* export the depth itself"),
+        (
+            pictures(lambda z: np.dstack([z / 8] * 3).astype(np.uint8)),
+            r"a picture of 3 channels of uint8, expected depth: .* Colour belongs into rgb/",
+        ),
+        (
+            lambda p: (p / "depth").rename(p / "Depth images"),
+            r"but Depth images/000000.png is an image: depth images lie in the folder itself or in",
+        ),
+        (lambda p: shutil.rmtree(p / "depth"), r"nothing in it is known \(poses.txt\), expected"),
+        (
+            lambda p: (shutil.rmtree(p / "depth"), (p / "poses.txt").unlink()),
+            r"an empty folder, expected a dataset or one of",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(change: Change, told: str, tmp_path: Path) -> None:
+    path = bare(tmp_path / "set")
+    change(path)
+    with pytest.raises(DatasetError, match=told) as caught:
+        importing.read(path, READING)
+    assert "\n" not in str(caught.value)
+
+
+def test_quaternions_with_the_scalar_first_are_read_when_it_is_said(tmp_path: Path) -> None:
+    path = bare(tmp_path / "set")
+    lines(scalar_first)(path)
+    recording = importing.read(path, replace(READING, quaternions="wxyz"))
+    assert_allclose(recording.T_world_camera, poses()[:FRAMES], rtol=0, atol=1e-9)
+    convention = recording.convention
+    undone = convention.undone(recording.T_world_camera)
+    assert_allclose(convention.applied(undone), recording.T_world_camera, rtol=0, atol=1e-12)
+
+
+def test_intrinsics_of_another_size_are_noticed(tmp_path: Path) -> None:
+    other = replace(READING, intrinsics=(525.0, 525.0, 319.5, 239.5))
+    with pytest.raises(DatasetError, match="outside of images of 80 x 60 pixels: expected fx fy"):
+        importing.read(bare(tmp_path / "set"), other)
+
+
+def test_sizes_are_told_for_people_to_judge(tmp_path: Path) -> None:
+    """Units that are all wrong by one factor change nothing in how frames overlap."""
+    path = bare(tmp_path / "set")
+    found = []
+    for factor in (1.0, 10.0):
+        scaled = replace(READING, depth_scale=factor * 0.001, pose_scale=factor)
+        told = importing.read(path, scaled).notes[-1]
+        assert told.startswith("points lie about ") and "from the cameras, whose places" in told
+        found.append(float(told.split()[3]))
+    assert found[1] == pytest.approx(10 * found[0], rel=0.01)
+
+
+def test_frames_without_any_depth_do_not_pass_in_silence(tmp_path: Path) -> None:
+    path = bare(tmp_path / "set")
+    write_png(path / "depth/000002.png", np.zeros((60, 80), np.uint16))
+    found = importing.into_dataset(importing.read(path, READING), tmp_path / "some", READING)
+    assert "nothing was measured in 1 frame (000002.png)" in found.notes
+    pictures(np.zeros_like)(path)
+    with pytest.raises(DatasetError, match=r"nothing was measured in any frame \(000000.png and"):
+        importing.into_dataset(importing.read(path, READING), tmp_path / "none", READING)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["convert", "{set}", "{out}", "--depth-range", "300", "2000"], "crop or the mask leaves"),
+        (["convert", "{set}", "{out}", "--roi", "5", "6", "5", "6", "0", "1"], "ranges in metres"),
+        (
+            ["register", "{set}", "--out", "{out}", "--depth-range", "300", "2000"],
+            "that its crop and its mask leave: expected --depth-range in metres",
+        ),
+        (
+            ["register", "{set}", "--out", "{out}", "--roi", "5", "6", "5", "6", "0", "1"],
+            "of the map frame, m: the points lie in -",
+        ),
+        (["plot", "{set}"], "expected a run, as `depthba register DATASET --out RUN` leaves it"),
+        (["evaluate", "{set}"], "expected a run, as `depthba register DATASET --out RUN` leaves"),
+        (["doctor", "{new}"], "no dataset.json in it, expected a dataset; `depthba convert` makes"),
+    ],
+)
+def test_verbs_say_the_next_step(
+    words: list[str],
+    told: str,
+    depth_set: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "new").mkdir()
+    places = {"set": depth_set.path, "out": tmp_path / "out", "new": tmp_path / "new"}
+    assert cli.main([word.format(**places) for word in words]) == 1
+    said = capsys.readouterr()
+    assert told in said.err + said.out
+    assert [p.name for p in tmp_path.iterdir()] == ["new"]
