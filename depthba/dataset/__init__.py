@@ -3,7 +3,7 @@
 from depthba.dataset.faults import Fault
 from depthba.dataset.model import Frame, Marker, StoredFile
 from depthba.dataset.reading import Dataset, is_dataset
-from depthba.dataset.sensor import PoseNoise, Sensor
+from depthba.dataset.sensor import HandEyeNoise, PoseNoise, Sensor
 from depthba.dataset.verifying import verify
 from depthba.dataset.writing import DatasetWriter
 
@@ -12,6 +12,7 @@ __all__ = [
     "DatasetWriter",
     "Fault",
     "Frame",
+    "HandEyeNoise",
     "Marker",
     "PoseNoise",
     "Sensor",

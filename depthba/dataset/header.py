@@ -15,13 +15,14 @@ from depthba.camera import Camera, RangeNoise
 from depthba.dataset import fields
 from depthba.dataset.faults import Faults, MalformedError
 from depthba.dataset.listing import inside
-from depthba.dataset.sensor import PoseNoise, Sensor
+from depthba.dataset.sensor import HandEyeNoise, PoseNoise, Sensor
 from depthba.errors import DatasetError
 from depthba.trajectory import read_text
 
 FORMAT = "depthba-dataset"
 VERSION = 1
 FILE = "dataset.json"
+Triple = tuple[float, float, float]
 _READ = (FILE, "frames.jsonl", "markers.json", "calibration.json")
 """Beside the poses, what is read without being listed."""
 
@@ -216,8 +217,17 @@ def _noise(raw: fields.Record) -> RangeNoise:
 
 
 def _pose_noise(raw: fields.Record) -> PoseNoise:
-    t = fields.numbers(fields.required(raw, "sigma_t_m"), "pose_noise.sigma_t_m", length=3, least=0)
-    r = fields.numbers(
-        fields.required(raw, "sigma_r_rad"), "pose_noise.sigma_r_rad", length=3, least=0
+    hand_eye = None
+    if raw.get("hand_eye") is not None:
+        name = "pose_noise.hand_eye"
+        hand_eye = HandEyeNoise(*_sigmas(fields.mapping(raw["hand_eye"], name), name))
+    return PoseNoise(*_sigmas(raw, "pose_noise"), hand_eye)
+
+
+def _sigmas(raw: fields.Record, name: str) -> tuple[Triple, Triple]:
+    """Return the standard deviations along three axes, m, and about them, rad."""
+    t, r = (
+        fields.numbers(fields.required(raw, key), f"{name}.{key}", length=3, least=0)
+        for key in ("sigma_t_m", "sigma_r_rad")
     )
-    return PoseNoise((t[0], t[1], t[2]), (r[0], r[1], r[2]))
+    return (t[0], t[1], t[2]), (r[0], r[1], r[2])

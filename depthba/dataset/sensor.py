@@ -34,6 +34,16 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class HandEyeNoise:
+    """Believed standard deviation of a hand-eye transform, per axis of the camera."""
+
+    sigma_t_m: tuple[float, float, float]
+    """Metres."""
+    sigma_r_rad: tuple[float, float, float]
+    """Radians."""
+
+
+@dataclass(frozen=True)
 class PoseNoise:
     """Believed standard deviation of the measured poses, per axis of the world."""
 
@@ -41,3 +51,5 @@ class PoseNoise:
     """Metres."""
     sigma_r_rad: tuple[float, float, float]
     """Radians."""
+    hand_eye: HandEyeNoise | None = None
+    """Of what all poses share beside: an error of the hand-eye transform; None: stated above."""

@@ -38,7 +38,7 @@ from depthba.optimiser.problem import (
     typical_noise,
 )
 from depthba.optimiser.solvable import solvable
-from depthba.optimiser.start import pose_sigmas
+from depthba.optimiser.start import hand_eye_sigmas, pose_sigmas, reach_of_poses
 from depthba.optimiser.waves import waves_of
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
@@ -102,6 +102,8 @@ class Registration:
             check_roi(self.options.roi)
         self._sensor, self._map_frame = sensor, map_frame
         self._sigmas = pose_sigmas(pose_noise, self.options)
+        self._hand_eye = hand_eye_sigmas(pose_noise, self.options)
+        self._reach = reach_of_poses(pose_noise, self.options)
         self._stated = pose_noise is not None or None not in (
             self.options.prior_t,
             self.options.prior_r,
@@ -270,7 +272,7 @@ class Registration:
     def _engine(self, problem: Problem, free: NDArray[np.bool_]) -> Engine:
         prior = pose_prior(
             problem.T_map_camera, self._T_map_world[:3, :3], *self._sigmas,
-            np.arange(len(free)) == 0,
+            np.arange(len(free)) == 0, self._hand_eye,
         )  # fmt: skip
         return Engine(
             problem, self.options, prior, free, self._workers, Clock(self.options.time_limit)
@@ -291,9 +293,9 @@ class Registration:
         lower, upper = bounds([problem.frames[i].points[:, :3] for i in chosen], poses[chosen])
         part = replace(part, lower=lower, upper=upper)
         finest = COARSER * (self.options.resolution or schedule.finest_spacing(problem))
-        levels = [
-            s for s in schedule.spacings(self.options, part, *self._sigmas) if s > finest
-        ] or [finest]
+        levels = [s for s in schedule.spacings(self.options, part, *self._reach) if s > finest] or [
+            finest
+        ]
         engine = self._engine(part, np.arange(len(chosen)) == len(chosen) - 1)
         engine.settled = PASSING
         out = poses.copy()

@@ -22,6 +22,9 @@ class PosePrior:
     frame 0 as it was measured, whose own error all other frames share: a degree in frame 0 shifts a
     frame five metres away by nine centimetres. So the errors are taken after the rigid motion, the
     *gauge*, that makes the cost least; it pays as frame 0's error.
+
+    Poses of a camera on a robot also share what is wrong with its hand-eye transform: one motion in
+    the camera's axes, after each measured pose. It is found with the gauge, and pays likewise.
     """
 
     T_map_camera: NDArray[np.float64]
@@ -31,6 +34,9 @@ class PosePrior:
     move."""
     gauge: NDArray[np.float64] | None = None
     """(6, 6), inverse covariance of frame 0's own error; None: it has none."""
+    hand_eye: NDArray[np.float64] | None = None
+    """(6, 6), inverse covariance of the hand-eye transform's error, camera axes; None: it has none,
+    as where frame 0 has none."""
 
     def distances(self, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (N,) by how many stated deviations each pose is off, over all six directions."""
@@ -55,39 +61,57 @@ class PosePrior:
         weighted = np.einsum("nji,njk->nik", J, self.information)
         matrix = block_diag(*(weighted @ J))
         if self.gauge is not None and self.information.any():
-            U = (weighted @ K).reshape(-1, 6)
+            U = (weighted @ K).reshape(matrix.shape[0], -1)
             matrix -= U @ self._inverse(K) @ U.T
         return matrix, np.einsum("nij,nj->ni", weighted, e)
 
     def _errors(
         self, T_map_camera: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Return the errors (N, 6), the gauge's rotation, its Jacobians (N, 6, 6) and its cost."""
-        centre = self.T_map_camera[:1, :3, 3]
-        G = np.eye(4)[None]
-        K = about_pivot(T_map_camera, centre)
-        if self.gauge is None or not self.information.any():
-            return se3.difference(T_map_camera, self.T_map_camera), np.eye(3), K, 0.0
-        for _ in range(ROUNDS):
-            moved, own = self._moved(T_map_camera, G)
-            K = about_pivot(moved, centre + own[:3])
-            e = se3.difference(moved, self.T_map_camera)
-            b = self.gauge @ own + np.einsum("nji,njk,nk->i", K, self.information, e)
-            G = move(G, centre + own[:3], -(self._inverse(K) @ b)[None])
-        moved, own = self._moved(T_map_camera, G)
-        e = se3.difference(moved, self.T_map_camera)
-        return e, G[0, :3, :3], K, float(own @ self.gauge @ own)
+        """Return the errors (N, 6), the gauge's rotation, Jacobians (N, 6, m) and what is paid.
 
-    def _moved(
-        self, T_map_camera: NDArray[np.float64], G: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the poses under the gauge (1, 4, 4), and what it does to frame 0 (6,)."""
-        first = self.T_map_camera[:1]
-        return G @ T_map_camera, se3.difference(G @ first, first)[0]
+        The Jacobians are by what all frames share: the gauge (6), then the hand-eye error (6) if
+        there is one.
+        """
+        if self.gauge is None or not self.information.any():
+            K = np.zeros((len(T_map_camera), 6, 6))
+            return se3.difference(T_map_camera, self.T_map_camera), np.eye(3), K, 0.0
+        G, x = np.eye(4)[None], np.zeros(6)
+        for k in range(ROUNDS + 1):
+            measured = self.T_map_camera @ se3.make(se3.exp_so3(x[3:]), x[:3])
+            first, moved = self.T_map_camera[:1], G @ T_map_camera
+            centre = (G @ first)[:, :3, 3]
+            own = se3.difference(G @ first, measured[:1])[0]
+            e = se3.difference(moved, measured)
+            K = about_pivot(moved, centre)
+            if self.hand_eye is not None:
+                K = np.concatenate([K, -_in_map(self.T_map_camera)], axis=2)
+            if k == ROUNDS:
+                break
+            b = np.einsum("nji,njk,nk->i", K, self.information, e)
+            b += self._of_first(K).T @ self.gauge @ own
+            if self.hand_eye is not None:
+                b[6:] += self.hand_eye @ x
+            step = -self._inverse(K) @ b
+            G = move(G, centre, step[None, :6])
+            if self.hand_eye is not None:
+                x = x + step[6:]
+        paid = float(own @ self.gauge @ own)
+        if self.hand_eye is not None:
+            paid += float(x @ self.hand_eye @ x)
+        return e, G[0, :3, :3], K, paid
+
+    def _of_first(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (6, m), the derivative of frame 0's own error."""
+        return np.concatenate([np.eye(6), K[0, :, 6:]], axis=1)
 
     def _inverse(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the inverse (6, 6) of what holds the gauge."""
-        H = self.gauge + np.einsum("nji,njk,nkl->il", K, self.information, K)
+        """Return the inverse (m, m) of what holds the motions that all frames share."""
+        first = self._of_first(K)
+        assert self.gauge is not None  # else nothing is shared
+        H = first.T @ self.gauge @ first + np.einsum("nji,njk,nkl->il", K, self.information, K)
+        if self.hand_eye is not None:
+            H[6:, 6:] += self.hand_eye
         own = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
         return np.asarray(np.linalg.pinv(H * np.outer(own, own), hermitian=True)) * np.outer(
             own, own
@@ -100,6 +124,7 @@ def pose_prior(
     sigma_t: NDArray[np.float64],
     sigma_r: NDArray[np.float64],
     fixed: NDArray[np.bool_],
+    hand_eye: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> PosePrior:
     """Build a prior from standard deviations along the world axes, frame 0's among them.
 
@@ -109,13 +134,23 @@ def pose_prior(
         sigma_t: (3,) m; infinity believes nothing.
         sigma_r: (3,) rad, likewise.
         fixed: (N,) frames that do not move and need none.
+        hand_eye: standard deviations (3,) m and (3,) rad of the hand-eye transform, camera axes;
+            None: it has no error that the poses do not state each for itself.
     """
     one = np.zeros((6, 6))
     one[:3, :3] = R_map_world @ np.diag(1.0 / np.square(sigma_t)) @ R_map_world.T
     one[3:, 3:] = R_map_world @ np.diag(1.0 / np.square(sigma_r)) @ R_map_world.T
     information = np.repeat(one[None], len(T_map_camera), axis=0)
     information[fixed] = 0.0
-    return PosePrior(T_map_camera, information, one)
+    shared = None if hand_eye is None else np.diag(1.0 / np.square(np.concatenate(hand_eye)))
+    return PosePrior(T_map_camera, information, one, shared)
+
+
+def _in_map(T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 6, 6) that turn a shift and a turn in the axes of each camera into the map's."""
+    out = np.zeros((len(T_map_camera), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = T_map_camera[:, :3, :3]
+    return out
 
 
 def about_pivot(

@@ -21,7 +21,7 @@ from depthba.optimiser.overlap import held_frames, overlap_matrix
 from depthba.optimiser.prior import pose_prior
 from depthba.optimiser.problem import prepare
 from depthba.optimiser.solvable import solvable
-from depthba.optimiser.start import pose_sigmas, start_poses
+from depthba.optimiser.start import hand_eye_sigmas, pose_sigmas, reach_of_poses, start_poses
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration, Result
@@ -77,14 +77,20 @@ def _register(
     problem = prepare(dataset, start, options.roi)
     clock.lap("read")
     sigma_t, sigma_r = pose_sigmas(dataset.pose_noise, options)
-    levels = schedule.spacings(options, problem, sigma_t, sigma_r)
+    reach = reach_of_poses(dataset.pose_noise, options)
+    levels = schedule.spacings(options, problem, *reach)
     make_grid(problem, levels[-1], 2 * levels[-1])  # too fine a map is refused before any work
     overlap = overlap_matrix(problem, problem.T_map_camera, levels[-1])
     held = held_frames(problem, overlap)
     free = np.array([not reason for reason in held])
     measured: NDArray[np.float64] = problem.T_map_world @ dataset.T_world_camera_measured
     prior = pose_prior(
-        measured, problem.T_map_world[:3, :3], sigma_t, sigma_r, np.arange(len(free)) == 0
+        measured,
+        problem.T_map_world[:3, :3],
+        sigma_t,
+        sigma_r,
+        np.arange(len(free)) == 0,
+        hand_eye_sigmas(dataset.pose_noise, options),
     )
     clock.lap("prepare")
     engine = Engine(problem, options, prior, free, workers, clock, callback)

@@ -31,7 +31,7 @@ def start_poses(dataset: Dataset, options: Options) -> NDArray[np.float64]:
     if init == "pairwise":
         from depthba.pairwise import dataset_poses
 
-        sigma_t, sigma_r = pose_sigmas(dataset.pose_noise, options)
+        sigma_t, sigma_r = reach_of_poses(dataset.pose_noise, options)
         return dataset_poses(dataset, sigma_t, sigma_r, options.threads).T_world_camera
     if not Path(init).is_file():
         raise OptionError(
@@ -49,10 +49,38 @@ def start_poses(dataset: Dataset, options: Options) -> NDArray[np.float64]:
     return np.stack(found)
 
 
+def hand_eye_sigmas(
+    noise: PoseNoise | None, options: Options
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return the standard deviations (3,) m and (3,) rad of what all measured poses share.
+
+    None where the dataset states none, or options speak of the measured poses themselves.
+    """
+    if noise is None or noise.hand_eye is None:
+        return None
+    if options.prior_t is not None or options.prior_r is not None:
+        return None
+    shared = noise.hand_eye
+    t, r = np.array(shared.sigma_t_m, dtype=float), np.array(shared.sigma_r_rad, dtype=float)
+    return np.maximum(t, 1e-6), np.maximum(r, 1e-6)
+
+
+def reach_of_poses(
+    noise: PoseNoise | None, options: Options
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the standard deviations (3,) m and (3,) rad of poses, with what they share."""
+    own, shared = pose_sigmas(noise, options), hand_eye_sigmas(noise, options)
+    if shared is None:
+        return own
+    # the camera's axes lie in the world as they may: the largest stands for all
+    t, r = (np.hypot(a, b.max()) for a, b in zip(own, shared, strict=True))
+    return t, r
+
+
 def pose_sigmas(
     noise: PoseNoise | None, options: Options
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the standard deviations (3,) m and (3,) rad of the measured poses.
+    """Return the standard deviations (3,) m and (3,) rad of the measured poses, each for itself.
 
     Options, dataset, or usual ones.
     """

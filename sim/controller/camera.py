@@ -69,6 +69,8 @@ class SimulatedCapture:
     """(4, 4), the world being the scene's."""
     joints_true: Array
     """(n,) rad."""
+    moment: float | None = None
+    """`stamp` on the steady clock, s; None: whoever owns the camera knows."""
 
 
 @dataclass(frozen=True)

@@ -156,20 +156,22 @@ def test_height_columns(ranged: bool) -> None:
             assert row[tuple(node)] == pytest.approx(change / 2e-7, abs=2e-6)
 
 
-def some_prior(isotropic: bool) -> tuple[Floats, Floats, PosePrior]:
+def some_prior(isotropic: bool, on_arm: bool = False) -> tuple[Floats, Floats, PosePrior]:
     rng = np.random.default_rng(2)
     measured = looking_down(5, rng)
     sigma_t = np.full(3, 0.01) if isotropic else np.array([0.01, 0.002, 0.05])
     sigma_r = np.full(3, 0.02) if isotropic else np.array([0.004, 0.02, 0.1])
     R_map_world = se3.exp_so3([0.3, -0.5, 0.2])
     return measured, rng.uniform(-1, 1, (5, 3)), pose_prior(
-        measured, R_map_world, sigma_t, sigma_r, np.arange(5) == 0
+        measured, R_map_world, sigma_t, sigma_r, np.arange(5) == 0,
+        (np.array([0.02, 0.03, 0.04]), np.array([0.03, 0.02, 0.01])) if on_arm else None,
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("on_arm", [False, True])
 @pytest.mark.parametrize("isotropic", [True, False])
-def test_prior_normal_equations(isotropic: bool) -> None:
-    measured, pivots, prior = some_prior(isotropic)
+def test_prior_normal_equations(isotropic: bool, on_arm: bool) -> None:
+    measured, pivots, prior = some_prior(isotropic, on_arm)
     rng = np.random.default_rng(3)
     T = se3.retract(measured, rng.normal(scale=0.003, size=(5, 6)))
     matrix, gradient = prior.normal_equations(T, pivots)
@@ -181,9 +183,11 @@ def test_prior_normal_equations(isotropic: bool) -> None:
         return np.array([prior.cost(p) for p in poses])
 
     numeric = derivative(cost, 1e-6) / 2
-    # the logarithm's derivative is taken as the identity, which isotropic rotations do not notice
+    # the logarithm's derivative is taken as the identity, which isotropic rotations about one place
+    # do not notice
+    exact = isotropic and not on_arm
     scale = np.abs(gradient).max()
-    np.testing.assert_allclose(gradient, numeric, atol=(1e-6 if isotropic else 5e-3) * scale)
+    np.testing.assert_allclose(gradient, numeric, atol=(1e-6 if exact else 5e-3) * scale)
     assert not gradient[0].any() and not matrix[:6].any()
 
 
@@ -201,6 +205,35 @@ def test_prior_knows_what_the_frames_share() -> None:
     np.testing.assert_allclose(
         np.linalg.inv(about_centres), want, rtol=1e-6, atol=1e-9 * np.abs(want).max()
     )
+
+
+def test_prior_knows_that_the_frames_share_a_hand_eye_transform() -> None:
+    """Its inverse holds that transform's covariance, seen from frame 0, in every frame."""
+    measured, _, prior = some_prior(False, on_arm=True)
+    assert prior.gauge is not None and prior.hand_eye is not None
+    carried = about_pivot(measured, measured[:1, :3, 3])[1:]
+    turned = np.stack([np.kron(np.eye(2), T[:3, :3]) for T in measured])
+    want = block_diag(*np.linalg.inv(prior.information[1:]))
+    shared = (turned[1:] - carried @ turned[0]).reshape(-1, 6)
+    carried = carried.reshape(-1, 6)
+    want = want + carried @ np.linalg.inv(prior.gauge) @ carried.T
+    want = want + shared @ np.linalg.inv(prior.hand_eye) @ shared.T
+    about_centres = prior.normal_equations(measured, measured[:, :3, 3])[0][6:, 6:]
+    np.testing.assert_allclose(
+        np.linalg.inv(about_centres), want, rtol=1e-6, atol=1e-9 * np.abs(want).max()
+    )
+
+
+def test_a_wrong_hand_eye_transform_costs_once_and_not_by_frame() -> None:
+    measured, _, prior = some_prior(True, on_arm=True)
+    # an arm is ten times better than that
+    assert prior.gauge is not None
+    prior = replace(prior, information=100 * prior.information, gauge=100 * prior.gauge)
+    wrong = se3.make(se3.exp_so3([0.02, -0.01, 0.015]), [0.01, 0.02, -0.02])
+    poses = measured @ wrong
+    poses = measured[0] @ np.linalg.inv(poses[0]) @ poses
+    assert prior.cost(poses) < 4.0
+    assert replace(prior, hand_eye=None).cost(poses) > 20.0
 
 
 def test_prior_lets_frame_0_pay_for_what_all_frames_share() -> None:
