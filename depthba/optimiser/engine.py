@@ -276,8 +276,8 @@ class Engine:
         sure: NDArray[np.float64] | None, final: bool,
     ) -> Outcome:  # fmt: skip
         believed, variance = known.inflation if known else 1.0, robust_sigma(lin.residuals) ** 2
-        # what steps so long lower the cost by, where residuals are as correlated as they are here:
-        # frames that slide would go on for as long as they may
+        # what so short steps seem to gain where residuals are correlated: frames that slide would
+        # go on for as long as they may
         step = PASSING**2 * 6 * max(int(self.free.sum()), 1) * variance
         rules = Rules(
             _scale(self.preset, phase),
@@ -285,7 +285,7 @@ class Engine:
             settled=self.settled if final else PASSING,
             steady=final and level.tied is not None,
             gain=(ENOUGH if level.tied else 0.0) if final else GAIN,
-            least=step * max(believed, known.overall) if known else 0.0,
+            least=step * (max(believed, known.overall) - 1.0) if known else 0.0,
             believed=believed,
         )
 

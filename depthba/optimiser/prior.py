@@ -83,11 +83,11 @@ class PosePrior:
             centre = (G @ first)[:, :3, 3]
             own = se3.difference(G @ first, measured[:1])[0]
             e = se3.difference(moved, measured)
+            if k == ROUNDS:
+                break
             K = about_pivot(moved, centre)
             if self.hand_eye is not None:
                 K = np.concatenate([K, -_in_map(self.T_map_camera)], axis=2)
-            if k == ROUNDS:
-                break
             b = np.einsum("nji,njk,nk->i", K, self.information, e)
             b += self._of_first(K).T @ self.gauge @ own
             if self.hand_eye is not None:

@@ -32,7 +32,9 @@ def _disturb(name: str, fault: str, home: Path, folder: Path) -> None:
     assert tally.runs == 1 and tally.broken == [] and tally.lost == 0
 
 
-@pytest.mark.parametrize("fault", ["SIGKILL", "read-only disk"])
+@pytest.mark.parametrize(
+    "fault", [pytest.param("SIGKILL", marks=pytest.mark.slow), "read-only disk"]
+)
 def test_generate_loses_nothing(fault: str, home: Path, tmp_path: Path) -> None:
     _disturb("generate", fault, home, tmp_path)
 
