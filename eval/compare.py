@@ -25,8 +25,8 @@ from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import DatasetError, RunError
 from depthba.picture import CELL_SPACINGS, SIGMAS, spread_png
-from depthba.run_folder import read_result
 from depthba.spread import CellSpread, cell_spread
+from depthba.stored_run import read_result
 from eval.evaluate import match_stamps
 from eval.metrics import Metric, pose_metrics
 from eval.recorded_frames import log_cloud, log_frustum, log_pose, shown_clouds

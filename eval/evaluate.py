@@ -20,8 +20,8 @@ from depthba.depth_map import DepthMap
 from depthba.errors import OptionError, RunError
 from depthba.options import options_of
 from depthba.picture import CELL_SPACINGS
-from depthba.run_folder import Run
 from depthba.selecting import selected
+from depthba.stored_run import Run
 from eval.bound import Bound
 from eval.bound import bound as cramer_rao
 from eval.map_metrics import cloud_metrics, height_metrics, patches, seen_nodes

@@ -17,7 +17,7 @@ from depthba.documents import parse_json
 from depthba.errors import RunError
 from depthba.options import Options, options_of
 from depthba.result import FrameReport, Result, WeakDirection
-from depthba.run_folder import Run
+from depthba.stored_run import Run
 from eval.evaluate import open_dataset
 from eval.metrics import Metric, start
 from eval.recording import Recorder

@@ -13,7 +13,7 @@ import psutil
 import pytest
 import yaml
 
-from depthba import documents, run_folder
+from depthba import documents, stored_run
 from depthba.errors import OptionError
 from eval import review
 from rig.session.reading import read_session
@@ -70,7 +70,7 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path: Path) -> None:
     np.savez(data, heights=np.array([Runs(ran)], dtype=object))
     (tmp_path / "map.npz").write_bytes(data.getvalue())
     with pytest.raises(ValueError, match="objects"):
-        run_folder.read_map(tmp_path / "map.npz")
+        stored_run.read_map(tmp_path / "map.npz")
     assert not ran.exists()
     pickle.loads(pickle.dumps(Runs(ran)))
     assert ran.exists()  # so it would have been seen

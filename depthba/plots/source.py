@@ -15,8 +15,8 @@ from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import RunError
 from depthba.options import Options, options_of
-from depthba.run_folder import Run
 from depthba.selecting import selected
+from depthba.stored_run import Run
 
 Floats = NDArray[np.float64]
 

@@ -91,7 +91,7 @@ def _frames(out: Path) -> dict[str, str]:
 
 def _run(out: Path) -> dict[str, str]:
     """A run counts as soon as its result.json is there, which is then the last."""
-    from depthba.run_folder import Run
+    from depthba.stored_run import Run
 
     if not (out / "result.json").exists():
         return {}

@@ -19,8 +19,9 @@ from depthba.errors import RunError
 from depthba.options import Options
 from depthba.ply import read_ply_points
 from depthba.result import FrameReport, Iteration, Result, WeakDirection
-from depthba.run_folder import Run, RunFolder, default_path, link_latest
+from depthba.run_folder import RunFolder, default_path, link_latest
 from depthba.spread import cell_spread
+from depthba.stored_run import Run
 
 Floats = NDArray[np.float64]
 SHAPE = (24, 32)

@@ -112,7 +112,7 @@ def guided(name: str, home: Path, seconds: float, seed: int, keep: Path) -> None
 
     with atheris.instrument_imports(
         include=["depthba.dataset", "depthba.convert", "depthba.trajectory", "depthba.ply",
-                 "depthba.run_folder", "depthba.ur_calibration", "rig.session", "rig.hand_eye",
+                 "depthba.stored_run", "depthba.ur_calibration", "rig.session", "rig.hand_eye",
                  "sim.controller", "depthba.verbs.arguments"],
         exclude=["depthba.convert.clouds.pcd"],  # numba compiles what is in it
     ):  # fmt: skip

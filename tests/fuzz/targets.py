@@ -228,7 +228,7 @@ _RESULT: dict[str, Any] = {
 def read_run(path: Path) -> None:
     """Read a run as `evaluate` and `review` do."""
     from depthba.dataset import Dataset
-    from depthba.run_folder import Run
+    from depthba.stored_run import Run
     from eval import rebuild
 
     run = Run.open(path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import RunError
-from depthba.run_folder import Run
+from depthba.stored_run import Run
 
 Array = NDArray[np.float64]
 

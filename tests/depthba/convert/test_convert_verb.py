@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from depthba import cli, se3
 from depthba.dataset import Dataset, verify
-from depthba.run_folder import Run
+from depthba.stored_run import Run
 from depthba.trajectory import write_tum
 from tests.depthba.convert import small_scene
 
