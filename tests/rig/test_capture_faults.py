@@ -23,7 +23,8 @@ from depthba.cli import main
 from depthba.dataset import Dataset, verify
 from rig.cameras import names
 from rig.session.interrupts import Interrupts
-from rig.session.opening import opened
+from rig.session.opening import Opened, opened
+from rig.session.options import Session
 from rig.session.reading import read_session
 from rig.session.record import begin
 from rig.session.running import Listeners, Run
@@ -144,6 +145,15 @@ def test_a_fault_on_the_way_ends_the_session_which_then_goes_on(
         assert "protective stop" in capsys.readouterr().err
 
 
+def begun(loaded: Session, ready: Opened, out: Path, listeners: Listeners, **more: Any) -> Run:
+    """Return a run at its beginning, in a new dataset."""
+    writer = begin(out, loaded, ready.space, ready.plan, ready.info, False)
+    return Run(
+        loaded, ready.space, ready.plan, ready.carrier, ready.camera, ready.info, writer, listeners,
+        **more,
+    )  # fmt: skip
+
+
 def test_where_somebody_can_be_asked_a_stop_pauses_the_session(
     tmp_path: Path, robot: Running
 ) -> None:
@@ -157,17 +167,7 @@ def test_where_somebody_can_be_asked_a_stop_pauses_the_session(
 
     loaded = read_session(session(tmp_path, robot, **SLOW))
     with opened(loaded, loaded, out, rehearsed=False, move=True) as ready:
-        writer = begin(out, loaded, ready.space, ready.plan, ready.info, False)
-        run = Run(
-            loaded,
-            ready.space,
-            ready.plan,
-            ready.carrier,
-            ready.camera,
-            ready.info,
-            writer,
-            Listeners(ask=ask),
-        )
+        run = begun(loaded, ready, out, Listeners(ask=ask))
         with when(on_the_way(out, robot), lambda: robot.fault("protective-stop")):
             summary = run()
     # Asked while it was held still, and again; then it went on from where it stood.
@@ -310,18 +310,7 @@ def test_ctrl_c_is_not_lost_where_python_swallows_it(tmp_path: Path, robot: Runn
             things.pop()
 
     with opened(loaded, loaded, out, rehearsed=False, move=True) as ready:
-        writer = begin(out, loaded, ready.space, ready.plan, ready.info, False)
-        run = Run(
-            loaded,
-            ready.space,
-            ready.plan,
-            ready.carrier,
-            ready.camera,
-            ready.info,
-            writer,
-            Listeners(say=said),
-            interrupts=interrupts,
-        )
+        run = begun(loaded, ready, out, Listeners(say=said), interrupts=interrupts)
         hook, sys.unraisablehook = sys.unraisablehook, lambda what: swallowed.append(what.exc_type)
         try:
             with pytest.raises(KeyboardInterrupt):
