@@ -26,6 +26,10 @@ from depthba.optimiser.reduced import Reduction, lumped
 from depthba.optimiser.stencil import MapSolver
 from depthba.optimiser.workers import Workers
 
+# Largest tolerance of a solve with the map's block: a looser one ends an iteration sooner or later
+# by how the last digits round, which moves poses of rough scenes by 1e-6 and costs as much.
+ALIKE = 1e-4
+
 
 @dataclass(frozen=True)
 class Step:
@@ -72,7 +76,7 @@ def solve(
             ``S0 S^-1 g``: where noise is all there is, the measured poses stand.
     """
     n = len(lin.B)
-    inner = 0.1 * tolerance
+    inner = min(0.1 * tolerance, ALIKE)
     solver = MapSolver(lin.C, inner, workers)
     answer, _ = solver.solve(-lin.g_map, inner)
     g = lin.g_pose + gather(lin, answer, workers)
