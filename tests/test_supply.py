@@ -31,7 +31,10 @@ IMPORTS = {
     "mkdocstrings-python": "mkdocstrings_handlers",
 }  # fmt: skip
 """Import name of what the extras bring."""
-BASE = {"matplotlib", "numba", "numpy", "cv2", "PIL", "yaml", "rich", "scipy", "small_gicp", "tyro"}
+BASE = {
+    "matplotlib", "numba", "numpy", "cv2", "PIL", "yaml", "rich", "scipy", "small_gicp",
+    "threadpoolctl", "tyro",
+}  # fmt: skip
 
 
 def _licences() -> ModuleType:

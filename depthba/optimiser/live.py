@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from depthba import se3
 from depthba.dataset import Frame, Sensor
@@ -144,7 +145,7 @@ class Registration:
             Unsolvable: lengths are such that the equations cannot be solved.
             Cancelled: ``cancel`` said so; the frame was not taken.
         """
-        with listening(self._cancel):
+        with listening(self._cancel), threadpool_limits(1, "blas"):
             return self._add(frame)
 
     def result(self) -> Result:
@@ -154,7 +155,7 @@ class Registration:
             DatasetError: fewer than two frames have points.
             Cancelled: ``cancel`` said so.
         """
-        with listening(self._cancel):
+        with listening(self._cancel), threadpool_limits(1, "blas"):
             return self._result()
 
     def _add(self, frame: Frame) -> Update:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from depthba.dataset import Dataset
 from depthba.optimiser import schedule
@@ -60,7 +61,8 @@ def register(
     clock = Clock(options.time_limit)
     workers = Workers(options.threads or os.cpu_count() or 1, cancel)
     try:
-        with listening(cancel):
+        # linear algebra on one thread: how many there are would change the last digits
+        with listening(cancel), threadpool_limits(1, "blas"):
             return _register(dataset, options, callback or (lambda _: None), clock, workers)
     finally:
         workers.close()

@@ -54,13 +54,16 @@ def test_runs_processes_and_threads_give_the_same_bits(scene: Dataset) -> None:
     assert result.depth_map.shape[0] >= 2 * LEAST_ROWS
     here = bits(result)
     root = Path(__file__).resolve().parents[2]
-    other = {"PYTHONHASHSEED": "7", "PYTHONPATH": str(root)}
-    there = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, str(scene.path), "1", "3"],
-        capture_output=True, text=True, env=os.environ | other, timeout=300, check=True,
-    )  # fmt: skip
-    found = [json.loads(line) for line in there.stdout.splitlines()]
-    assert found == [here] * 2
+    for linear_algebra, threads in (("1", ("1", "3")), ("2", ("1",))):
+        other = {
+            "PYTHONHASHSEED": "7", "PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": linear_algebra,
+        }  # fmt: skip
+        there = subprocess.run(
+            [sys.executable, "-c", ELSEWHERE, str(scene.path), *threads],
+            capture_output=True, text=True, env=os.environ | other, timeout=300, check=True,
+        )  # fmt: skip
+        found = [json.loads(line) for line in there.stdout.splitlines()]
+        assert found == [here] * len(threads)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
