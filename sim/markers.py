@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from depthba.camera import Camera
 from depthba.se3 import inverse
@@ -21,6 +22,9 @@ FEWEST = 5
 
 WHOLE = 0.9
 """Share of its disc's pixels that must be in sight: the mean of a half-hidden disc is off."""
+
+RINGS, SPOKES = 20, 36
+"""Pieces of a disc that its observation is averaged over."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +57,17 @@ def discs_of(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Disc, ...]:
 def observe(
     disc: Disc, camera: Camera, T_world_camera: Array, hits: Hits, depth: Array
 ) -> Array | None:
-    """Where a frame sees a marker: the mean (3,) of the disc's measured points, camera frame, m.
+    """Where a frame sees a marker: the mean (3,) over the disc as measured, camera frame, m.
+
+    The mean is over the disc's area, each piece of which is off by what the nearest pixel that
+    shows the disc is off: over those pixels alone it would hang on how their raster meets the
+    outline, by half a millimetre at 3 m, alike for all frames of a station.
 
     `depth` is what the sensor measured (NaN: nothing), `hits` says which pixels show the disc. None
     where the disc leaves the image, is mostly hidden, or covers too few pixels.
     """
-    centre = _to_camera(T_world_camera, disc.p_world)
+    T_camera_world = inverse(T_world_camera)
+    centre = T_camera_world[:3, :3] @ disc.p_world + T_camera_world[:3, 3]
     if centre[2] <= 0.0:
         return None
     u, v = camera.project(centre[None])[0]
@@ -71,9 +80,17 @@ def observe(
     pixels = np.pi * disc.radius**2 * facing * camera.fx * camera.fy / centre[2] ** 2
     if len(points) < max(FEWEST, WHOLE * pixels - 2.0 * np.sqrt(pixels)):
         return None
-    return np.asarray(points.mean(axis=0))
+    normal = T_camera_world[:3, :3] @ disc.normal
+    longer = points @ normal / float(centre @ normal)  # than the ray to the disc's plane
+    pieces = centre + disc.radius * _pieces(normal)
+    _, nearest = cKDTree(camera.project(points)).query(camera.project(pieces))
+    return np.asarray((pieces * longer[nearest, None]).mean(axis=0))
 
 
-def _to_camera(T_world_camera: Array, p_world: Array) -> Array:
-    T = inverse(T_world_camera)
-    return np.asarray(T[:3, :3] @ p_world + T[:3, 3])
+def _pieces(normal: Array) -> Array:
+    """Return (n, 3) points of equal shares of a unit disc, whose mean is its centre."""
+    across = np.linalg.svd(normal[None])[2][1:]
+    angle = np.arange(SPOKES) * 2 * np.pi / SPOKES
+    radius = np.sqrt((np.arange(RINGS) + 0.5) / RINGS)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across
+    return np.asarray((radius[:, None, None] * spokes).reshape(-1, 3))

@@ -122,8 +122,9 @@ def test_markers_are_seen_where_they_are(noisy_bay: Path, clean_bay: Path) -> No
         for frame, p_camera in markers[name].observations:
             T = dataset.T_world_camera_true[frame]
             error = T[:3, :3] @ p_camera + T[:3, 3] - markers[name].p_world
-            # Across, the mean over a disc of five pixels; along, the noise of the mean.
-            assert np.linalg.norm(error[:2]) < 0.003
+            # Along, the noise of the mean over a disc of five pixels; across, what of it the rays
+            # carry there, and nothing of the pixels' raster.
+            assert np.linalg.norm(error[:2]) < 0.0001
             assert abs(error[2]) < 4 * 0.00032 / np.sqrt(10)
     before = {m.name: m for m in Dataset.open(clean_bay).markers()}["origin"].observations[0][1]
     assert not np.array_equal(before, markers["origin"].observations[0][1])  # noise included
