@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from depthba.optimiser import certainty, pattern, reduced
 from depthba.optimiser.bends import without_bends
@@ -19,11 +20,13 @@ from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, r
 from depthba.optimiser.problem import Problem
 
 # Times that the last level goes on.
-AGAIN = 4
+AGAIN = 8
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
-BENT = 0.3
+BENT = 0.1
+# How much farther than asked for a pattern goes at most, in steps.
+FARTHEST = 4.0
 # A pattern up to so many times the noise that the sensor states is taken at its word.
 MODEST = 2.0
 # A larger one must leave residuals whose inflation is below this share of what it was. Wrong
@@ -60,12 +63,45 @@ class _Before:
     """Root mean square of the pattern over the image, m."""
 
 
+@dataclass
+class Trail:
+    """Where patterns were taken off, and where each asked to go.
+
+    The pattern that the points show is the one taken off but for a share of what was still left of
+    it, which poses and loss have yet to follow: a linear process, whose end two steps tell
+    (Anderson 1965).
+    """
+
+    here: NDArray[np.float64] | None = None
+    asked: NDArray[np.float64] | None = None
+
+    def next(
+        self, here: NDArray[np.float64] | None, shown: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the pattern (m,) to take off next.
+
+        Args:
+            here: (m,) the one that is taken off now; None: none.
+            shown: (m,) the one that the points show.
+        """
+        here = np.zeros_like(shown) if here is None else here
+        asked, step = shown - here, shown - here
+        if self.here is not None and self.asked is not None:
+            went, change = here - self.here, asked - self.asked
+            share = float(asked @ change / max(change @ change, 1e-300))
+            if -FARTHEST < share < 0.0:
+                step = asked - share * (went + change)
+        self.here, self.asked = here, asked
+        return here + step
+
+
 def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
     """Go on from the end of the last level for as long as what is known there asks for it.
 
     Returns where that ends, and what is known there if it was found out.
     """
     before: _Before | None = None
+    trail = Trail()
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
         if before is not None and there.inflation > CLEARED * before.inflation:
@@ -85,7 +121,7 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
         state, lin, index = outcome.state, outcome.lin, end.index
         if bent and there.believed is not None:
             before = _on_trial(engine, end, there)
-            level = engine.unbent(level, there.believed.pattern)
+            level = engine.unbent(level, trail.next(engine.bend, there.believed.pattern))
             state, lin = engine.map_solved(level, state)
         if finer < level.grid.spacing:
             index += 1

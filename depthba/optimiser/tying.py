@@ -36,9 +36,12 @@ class Round:
     steep, which is worth more than what noise in the normals costs while frames are misaligned."""
 
 
-FAR = Round((2.5,), 10.0, along_ray=False)
+# Two spacings of a coarse map may be left between frames: smaller voxels would tie what is not
+# the same.
+FAR = Round((4.0,), 10.0, along_ray=False)
+NEAR = Round((2.5,), 10.0, along_ray=False)
 CLOSE = Round((3.3, 1.7), 3.5, along_ray=True)
-ROUNDS = (FAR, FAR, CLOSE)
+ROUNDS = (FAR, FAR, NEAR, NEAR, CLOSE)
 # Points beyond which every so many are left out: the finest map takes them all.
 MOST = 500_000
 # Most steps in a round, and how many standard deviations one is long when they have settled.
