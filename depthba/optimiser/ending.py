@@ -6,7 +6,7 @@ or a finer map is allowed; and the camera may have a fixed pattern to be taken o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ class Trail:
         asked, step = shown - here, shown - here
         if self.here is not None and self.asked is not None:
             went, change = here - self.here, asked - self.asked
-            share = float(asked @ change / max(change @ change, 1e-300))
+            share = float(asked @ change) / max(float(change @ change), 1e-300)
             if -FARTHEST < share < 0.0:
                 step = asked - share * (went + change)
         self.here, self.asked = here, asked
@@ -139,8 +139,8 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
     lin = linearise(problem, level.grid, state, loss, workers, level.smooth)
     at = reduced.reduce(lin, workers, free=engine.free)
     if level.tied:
-        # what groups of points say is told from surfaces that fit
-        level = replace(level, tied=level.tied.patches.fitted(state.T_map_camera, workers))
+        # no point vouches twice
+        level = engine.patched(level, state, lin, 0.0)
     at = engine.with_patches(level, state, lin, at)
     believed = _believed(engine, problem, level.grid, state, loss, lin, at)
     found = certainty.correlation(

@@ -18,7 +18,7 @@ from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import Outcome, Progress, Rules, solve_level, solve_map
-from depthba.optimiser.tying import patches_beside, tied_by_patches
+from depthba.optimiser.tying import SHARED, patches_beside, tied_by_patches
 from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration
@@ -131,7 +131,7 @@ class Engine:
             level, state, lin = self.lay(levels[index], poses, before, last)
             for phase in phases(1 if refining else index, self.preset):
                 if last and phase == phases(1, self.preset)[-1]:
-                    level = self._patched(level, state, lin)
+                    level = self.patched(level, state, lin)
                 near = reduced.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
@@ -157,7 +157,7 @@ class Engine:
         known: certainty.Correlation | None,
     ) -> End:  # fmt: skip
         """Lay patches anew beside the last level's map, and settle on both."""
-        level, phase = self._patched(level, state, lin), phases(1, self.preset)[-1]
+        level, phase = self.patched(level, state, lin), phases(1, self.preset)[-1]
         near = reduced.reduce(lin, self.workers, NEAR, self.free)
         temperature, outcome = self._descend(
             level, state, lin, near, phase, index, index + 1, known, True
@@ -213,13 +213,18 @@ class Engine:
         self.clock.lap("patches")
         return poses
 
-    def _patched(self, level: Level, state: State, lin: Linearisation) -> Level:
-        """Return the level with patches laid anew over what its map cannot hold."""
+    def patched(
+        self, level: Level, state: State, lin: Linearisation, shared: float = SHARED
+    ) -> Level:
+        """Return the level with patches laid anew over what is steep.
+
+        ``shared``: weight of the points there that the map takes at their full weight, too.
+        """
         if not self._patches_vouch:
             return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
-            robust_sigma(lin.residuals), self.workers,
+            robust_sigma(lin.residuals), self.workers, shared,
         )  # fmt: skip
         return replace(level, tied=tied)
 

@@ -265,19 +265,26 @@ class Cloud:
     """Whether points lie on rays from the origin of their sensor."""
 
     @staticmethod
-    def of(problem: Problem, taken: list[NDArray[np.bool_]] | None = None) -> Cloud:
-        """Return all points of a problem, or those that ``taken`` says of each frame."""
-        each = [
-            np.arange(len(f)) if taken is None else np.flatnonzero(taken[i])
-            for i, f in enumerate(problem.frames)
-        ]
-        parts = [f.points[k] for f, k in zip(problem.frames, each, strict=True)]
+    def of(problem: Problem) -> Cloud:
+        """Return all points of a problem."""
+        parts = [f.points for f in problem.frames]
         return Cloud(
             np.concatenate([p[:, :3] for p in parts]).astype(np.float64),
             np.concatenate([p[:, 3] for p in parts]).astype(np.float64) ** 2,
-            np.repeat(np.arange(len(each)), [len(k) for k in each]),
-            np.concatenate(each),
+            np.repeat(np.arange(len(parts)), [len(p) for p in parts]),
+            np.concatenate([np.arange(len(p)) for p in parts]),
             problem.origin,
+        )
+
+    def weighed(self, factor: Array) -> Cloud:
+        """Return the points with their weights times a factor (n,), without those of none."""
+        k = factor > 0
+        return replace(
+            self,
+            points=self.points[k],
+            weights=factor[k] * self.weights[k],
+            frame=self.frame[k],
+            source=self.source[k],
         )
 
 

@@ -49,6 +49,8 @@ STEPS, SETTLED = 8, 0.1
 # Largest median distance of a patch's points from its surface beside a map, in deviations of the
 # noise.
 TRUE = 1.0
+# Weight of a point in a patch beside a map whose cell takes it at its full weight, too.
+SHARED = 0.5
 # Standard deviation of the noise where none is stated, in spacings of the points.
 SUPPOSED = 0.02
 
@@ -123,11 +125,11 @@ def _settled(
 
 def patches_beside(
     problem: Problem, T_map_camera: Array, spacing: float, robust: float, sigma: float,
-    workers: Workers,
+    workers: Workers, shared: float = SHARED,
 ) -> Fit | None:  # fmt: skip
-    """Return patches over what a map cannot hold, fitted at the poses (N, 4, 4); None: nothing.
+    """Return patches over what is steep, fitted at the poses (N, 4, 4); None: nothing.
 
-    Only steep ones whose points lie on them but for noise: the map's cells say the rest better.
+    Only such whose points lie on them but for noise: the map's cells say the rest better.
 
     Args:
         problem: the points.
@@ -136,10 +138,13 @@ def patches_beside(
         robust: scale of the loss, in robust standard deviations of the residuals.
         sigma: standard deviation of the points' noise, m.
         workers: the threads.
+        shared: weight of the points that the map takes at their full weight, too.
     """
-    rough = rough_points(problem, T_map_camera, spacing)
+    rough = np.concatenate(rough_points(problem, T_map_camera, spacing))
     sides = tuple(s * spacing for s in CLOSE.sides)
-    laid = lay(Cloud.of(problem, rough), T_map_camera, sides, robust, sigma, workers).patches
+    cloud = Cloud.of(problem)
+    cloud = cloud.weighed(np.where(rough, 1.0, shared))
+    laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).patches
     if len(laid):
         laid = laid.true(T_map_camera, workers, TRUE * sigma)
     if not len(laid):
