@@ -155,7 +155,7 @@ def times(views: Views, factor: float) -> Views:
     [
         # seeds at which the wrong frame finds a place where it settles
         pytest.param(
-            lambda: turned_over(look(frames=4, seed=3)), {}, "frame 1 lies", id="upside down"
+            lambda: turned_over(look(frames=4, seed=5)), {}, "frame 1 lies", id="upside down"
         ),
         pytest.param(
             lambda: pose_of_elsewhere(look(frames=4, seed=3)),
