@@ -152,7 +152,8 @@ def _tum(path: Path, rows: list[tuple[int, list[float]]]) -> Poses:
     if (off := np.abs(lengths - 1)).max() > 1e-2:
         k = int(np.argmax(off))
         raise DatasetError(
-            f"{path}: line {rows[k][0]}: quaternion of length {lengths[k]:.6g}, expected 1 in {_FIELDS}"
+            f"{path}: line {rows[k][0]}: quaternion of length {lengths[k]:.6g}, expected 1 in "
+            f"{_FIELDS}"
         )
     return Poses(path, se3.from_quaternion(values[:, 1:4], values[:, 4:]), values[:, 0])
 
