@@ -145,6 +145,11 @@ def _check(reading: Reading) -> None:
         value = getattr(reading, name)
         if value is not None and not value > 0:
             raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected above 0")
+    if (scale := reading.depth_scale) is not None and scale > 1.0 and not reading.unchecked:
+        raise OptionError(
+            f"--depth-scale {scale:g}: expected metres a step, such as {1 / scale:g} for {scale:g} "
+            "steps a metre, or --unchecked"
+        )
 
 
 def _depth(frame: SourceFrame, source: Path) -> Array | None:

@@ -15,20 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.convert import frame_pairs, relief
+from depthba.convert.frame_pairs import Pair
 from depthba.convert.reading import Axes, Direction, Quaternions
 from depthba.convert.recording import Convention, Recording
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
 
-PAIRS = 6
-"""Pairs of frames that are laid on one another."""
-FIXED_POINTS, MOVED_POINTS = 20_000, 1500
-"""Points of the one frame, and of the other, at most."""
-TURN, SHIFT = 0.2, 0.25
-"""A pair has moved enough when it has turned by that, rad, or shifted by that part of the range."""
-TOLERANCE = 0.02
-"""Of the range: points that near are the same."""
 FACTORS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
 """Between the units of poses and of depth that people mix up."""
 LEAST_SHIFT = 0.01
@@ -38,6 +32,8 @@ GOOD, BETTER = 0.3, 0.2
 more, and at least twice as many."""
 ENOUGH, NOTICEABLE = 0.7, 0.1
 """Below the one, other units are looked at; by the other more of the points is worth a word."""
+LITTLE = 0.25
+"""Frames of one scene agree in more."""
 AS_GOOD = 0.8
 """With that part of the declared convention's share, another is as good."""
 
@@ -63,7 +59,8 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
     """Return what the overlap says, and notes.
 
     Raises:
-        DatasetError: the frames overlap under another convention, not under this one.
+        DatasetError: the frames overlap under another convention, not under this one; or the
+            relief of the ground that they share fits with other units alone.
 
     """
     verdict = judge(recording)
@@ -71,18 +68,28 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
     if np.isnan(verdict.share):
         return verdict, ("too few points or poses to see whether the conventions are right",)
     if verdict.best != declared:
+        # a mixture of wrong things may explain poses of other frames by chance
+        unsure = verdict.best_share < 0.5
+        doubt = "; or are the poses those of other frames, the intrinsics right?" if unsure else ""
         raise DatasetError(
             f"{recording.path}: frames agree in {verdict.share:.0%} of their points with "
             f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
-            f"expected {_options(declared, verdict.best, recording)}, or --unchecked"
+            f"expected {_options(declared, verdict.best, recording)}, or --unchecked{doubt}"
+        )
+    finer = relief.better(recording, FACTORS)
+    if finer is not None:
+        raise DatasetError(
+            f"{recording.path}: the ground that frames share differs {finer.ratio:.3g} times as "
+            f"much as with poses {finer.convention.scale / declared.scale:g} times as large: "
+            f"expected {_options(declared, finer.convention, recording)}, or --unchecked"
         )
     notes: tuple[str, ...] = (
         f"frames agree in {verdict.share:.0%} of their points with {declared}",
     )
-    if verdict.share < 0.1:
+    if verdict.share < LITTLE:
         notes = (
-            f"{notes[0]}, which is little, but no other convention does better: "
-            "are the poses those of these frames?",
+            f"{notes[0]}, which is little, but no other convention does better: are the poses "
+            "those of these frames, and the intrinsics right?",
         )
     if verdict.as_good:
         others = ", or ".join(map(str, verdict.as_good))
@@ -100,7 +107,7 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
 
 def judge(recording: Recording) -> Verdict:
     """Lay pairs of frames on one another, under the convention and under others."""
-    pairs = list(_pairs(recording))
+    pairs = list(frame_pairs.pairs(recording))
     declared = recording.convention
     if not pairs:
         return Verdict(float("nan"), declared, float("nan"))
@@ -122,65 +129,20 @@ def judge(recording: Recording) -> Verdict:
     return Verdict(share, best, others[best])
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    i: int
-    j: int
-    tree: object
-    """Of the points of frame i."""
-    moved: Array
-    """(n, 3), points of frame j, m."""
-    tolerance: float
-    """m."""
-    reach: float
-    """Typical distance of the points of frame i, m."""
-
-
-def _pairs(recording: Recording) -> Iterator[_Pair]:
-    """Give pairs of frames, spread over the recording, between which the camera has moved."""
-    from scipy.spatial import cKDTree
-
-    poses = recording.T_world_camera
-    if len(poses) < 2:
-        return
-    for i in sorted({round(k) for k in np.linspace(0, len(poses) - 1, PAIRS)}):
-        fixed = _points(recording, i, FIXED_POINTS)
-        if len(fixed) < 100:
-            continue
-        reach = float(np.median(np.linalg.norm(fixed, axis=1)))
-        tree = cKDTree(fixed)
-        spacing = float(np.median(tree.query(fixed[:: max(1, len(fixed) // 500)], k=2)[0][:, 1]))
-        # which are neighbours depends on which way the poses map: those of either way are tried
-        for j in sorted({_neighbour(T, i, reach) for T in (poses, se3.inverse(poses))}):
-            points = _points(recording, j, MOVED_POINTS)
-            if len(points) >= 100:
-                yield _Pair(i, j, tree, points, max(2 * spacing, TOLERANCE * reach), reach)
-
-
-def _neighbour(poses: Array, i: int, reach: float) -> int:
-    """Return the nearest of the frames that have moved enough: it sees most of the same ground."""
-    between = se3.inverse(poses[i]) @ poses
-    turned = np.linalg.norm(se3.log_so3(between[:, :3, :3]), axis=1) / TURN
-    shifted = np.linalg.norm(between[:, :3, 3], axis=1) / (SHIFT * reach)
-    moved = np.maximum(turned, shifted)
-    enough = np.nonzero(moved >= 1)[0]
-    return int(enough[np.argmin(moved[enough])] if len(enough) else np.argmax(moved))
-
-
-def _share(pairs: list[_Pair], poses: Array, convention: Convention) -> float:
+def _share(pairs: list[Pair], poses: Array, convention: Convention) -> float:
     """Return the part of the points that agree: the better of a frame's neighbours, their mean."""
     shares: dict[int, float] = {}
     for pair in pairs:
         T_i, T_j = convention.applied(poses[[pair.i, pair.j]])
         T = se3.inverse(T_i) @ T_j
         p = pair.moved @ T[:3, :3].T + T[:3, 3]
-        found = pair.tree.query(p, distance_upper_bound=pair.tolerance)[0]  # type: ignore[attr-defined]
+        found = pair.tree.query(p, distance_upper_bound=pair.tolerance)[0]
         shares[pair.i] = max(shares.get(pair.i, 0.0), float(np.isfinite(found).mean()))
     return float(np.mean(list(shares.values())))
 
 
 def _rescaled(
-    pairs: list[_Pair], poses: Array, declared: Convention, share: float
+    pairs: list[Pair], poses: Array, declared: Convention, share: float
 ) -> tuple[Convention, float] | None:
     """Return the convention of other units that does noticeably better, and its share."""
     others = [replace(declared, scale=declared.scale * factor) for factor in FACTORS]
@@ -189,7 +151,7 @@ def _rescaled(
     return (best, found[best]) if found and found[best] > share + NOTICEABLE else None
 
 
-def _moves(pairs: list[_Pair], poses: Array, convention: Convention) -> bool:
+def _moves(pairs: list[Pair], poses: Array, convention: Convention) -> bool:
     """Tell whether the camera moves noticeably, though not beyond what it sees."""
     shifts = []
     for pair in pairs:
@@ -228,23 +190,3 @@ def _options(declared: Convention, best: Convention, recording: Recording) -> st
             factor = best.scale / declared.scale
             words.append(f"(or --depth-scale {recording.depth_scale / factor:g})")
     return " ".join(words)
-
-
-def _points(recording: Recording, k: int, most: int) -> Array:
-    """Return at most so many points (n, 3) of a frame, m."""
-    frame = recording.frames[k]
-    if frame.depth is None:
-        assert frame.cloud is not None
-        points = frame.cloud()
-        return np.asarray(points[:: max(1, len(points) // most)])
-    assert frame.camera is not None
-    z, rays = frame.depth(), frame.camera.rays()
-    if z.shape != rays.shape[:2]:
-        raise DatasetError(
-            f"{recording.path}: {frame.name}: {z.shape[1]} x {z.shape[0]} pixels, "
-            f"expected {frame.camera.width} x {frame.camera.height}"
-        )
-    step = max(1, int(np.sqrt(z.size / most)))
-    z, rays = z[step // 2 :: step, step // 2 :: step], rays[step // 2 :: step, step // 2 :: step]
-    seen = np.isfinite(z) & (z > 0) & np.isfinite(rays[..., 0])
-    return np.asarray(rays[seen] * z[seen][:, None])

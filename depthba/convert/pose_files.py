@@ -14,6 +14,7 @@ from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
 
+_FIELDS = "stamp tx ty tz qx qy qz qw"
 _SAME = 1e-6
 """Stamps that differ by no more are the same, s."""
 
@@ -138,12 +139,21 @@ def _rows(path: Path, limit: int | None = None) -> list[tuple[int, list[float]]]
 
 def _tum(path: Path, rows: list[tuple[int, list[float]]]) -> Poses:
     values = np.array([row for _, row in rows])
+    for at, row in rows:
+        for name, value in zip(
+            ("stamp", *["tx", "ty", "tz", "qx", "qy", "qz", "qw"]), row, strict=True
+        ):
+            if not np.isfinite(value):
+                raise DatasetError(
+                    f"{path}: line {at}: {name} is {value}, expected a finite number, or no line "
+                    "for a frame without a pose"
+                )
     lengths = np.linalg.norm(values[:, 4:], axis=1)
-    if (worst := np.abs(lengths - 1)).max() > 1e-2 or not np.isfinite(values).all():
-        k = int(np.argmax(np.where(np.isfinite(worst), worst, np.inf)))
+    if (off := np.abs(lengths - 1)).max() > 1e-2:
+        k = int(np.argmax(off))
         raise DatasetError(
             f"{path}: line {rows[k][0]}: quaternion of length {lengths[k]:.6g}, expected 1 in "
-            "stamp tx ty tz qx qy qz qw"
+            f"{_FIELDS}"
         )
     return Poses(path, se3.from_quaternion(values[:, 1:4], values[:, 4:]), values[:, 0])
 

@@ -69,6 +69,8 @@ def recognise(path: Path) -> Format:
 def _unknown(path: Path) -> str:
     """Say what is there in place of a known source, and what it may have been meant as."""
     if path.is_file():
+        if path.suffix.lower() in (*files.DEPTH_SUFFIXES, *files.COLOUR_SUFFIXES):
+            return "one image, while a source is the folder of images and poses"
         return f"a file of no known kind ({path.suffix or 'without a suffix'})"
     try:
         there = sorted(path.iterdir())
@@ -76,11 +78,12 @@ def _unknown(path: Path) -> str:
         return f"cannot be read ({error.strerror})"
     if not there:
         return "an empty folder"
-    for folder in (p for p in there if p.is_dir()):
+    folders = [p for p in there if p.is_dir()]
+    for folder in (*folders, *(p for f in folders for p in sorted(f.iterdir()) if p.is_dir())):
         if images := files.listed(folder, files.DEPTH_SUFFIXES):
             return (
-                f"nothing in it is known, but {folder.name}/{images[0].name} is an image: depth "
-                "images lie in the folder itself or in depth/"
+                f"nothing in it is known, but {images[0].relative_to(path)} is an image: depth "
+                "images lie in the folder itself or in depth/, all in one"
             )
     for folder in (path / "depth", path):
         if images := files.listed(folder, files.COLOUR_SUFFIXES):

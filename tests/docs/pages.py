@@ -3,7 +3,6 @@
 A comment alone on the line before a block is one of
 
     <!-- not run: REASON -->    shown only: hardware, downloads, windows
-    <!-- slow: REASON -->       run by `pytest -m slow` alone
     <!-- file: NAME -->         written to a file of that name, too, where later blocks find it
     <!-- status: N -->          the last command ends with that status
 """
@@ -18,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 RUN = ("sh", "python")
 """Languages that are run; any other block is not code of ours."""
 SHOWN = ("text", "json", "toml", "yaml")
-KEYS = ("not run", "slow", "file", "status")
+KEYS = ("not run", "file", "status")
 
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[\w-]*)\s*$")
 _NOTE = re.compile(r"^ *<!-- (?P<key>[a-z ]+): (?P<value>.+) -->$")

@@ -21,17 +21,16 @@ FRAMES = 11
 """Of the wide images: every tenth leaves two."""
 
 
-def built(folder: Path, registered: bool) -> Path:
-    """Write two small datasets, and register them where runs are wanted; return the folder."""
+def small(folder: Path) -> Path:
+    """Write two small datasets and their runs; return the folder."""
     for seed, (run, data) in enumerate(RUNS.items()):
         write_scene(folder / data, frames=5, seed=seed)
-        if registered:
-            status = main(["register", str(folder / data), "--out", str(folder / run)])
-            assert status == 0, f"{data}: status {status}"
+        status = main(["register", str(folder / data), "--out", str(folder / run)])
+        assert status == 0, f"{data}: status {status}"
     return folder
 
 
-def laid_out(stage: Path, folder: Path, without: Sequence[str]) -> None:
+def laid_out(stage: Path, folder: Path, without: Sequence[str] = ()) -> None:
     """Copy what a reader has into a folder; a copied run is of the dataset beside it."""
     for item in stage.iterdir():
         if item.name not in without:
@@ -44,8 +43,11 @@ def laid_out(stage: Path, folder: Path, without: Sequence[str]) -> None:
             file.write_text(json.dumps(told))
 
 
-def wide(folder: Path) -> None:
-    """Write my-pngs, images of 640 x 480 in mm beside a TUM file, and a TUM RGB-D sequence."""
+def wide(folder: Path) -> Path:
+    """Write my-pngs, images of 640 x 480 in mm beside a TUM file, and a TUM RGB-D sequence.
+
+    Returns the folder.
+    """
     lens = {"fx": FOCAL, "fy": FOCAL, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
     sensor = {"kind": "depth", "model": "", "width": WIDTH, "height": HEIGHT, **lens}
     sensor |= {"distortion": [0, 0, 0, 0, 0], "depth_scale": 0.001}
@@ -67,6 +69,7 @@ def wide(folder: Path) -> None:
     lines = (folder / "wide" / "poses_measured.txt").read_text().splitlines()
     poses = [line for line in lines if not line.startswith("#")]
     (bare / "poses.txt").write_text("\n".join(poses[:3]) + "\n")
+    return folder
 
 
 def _depth(T: np.ndarray, lens: dict[str, float]) -> np.ndarray:
@@ -75,9 +78,11 @@ def _depth(T: np.ndarray, lens: dict[str, float]) -> np.ndarray:
     x, y = (u - lens["cx"]) / lens["fx"], (v - lens["cy"]) / lens["fy"]
     rays = np.stack([x, y, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
     z = -T[2, 3] / rays[..., 2]
-    for _ in range(15):
+    step = np.array(np.inf)
+    while np.abs(step).max() > 1e-6:  # a thousandth of a step of the images
         p = T[:3, 3] + z[..., None] * rays
         height, along_x, along_y = bumpy(p[..., 0], p[..., 1])
         slope = rays[..., 2] - along_x * rays[..., 0] - along_y * rays[..., 1]
-        z = z - (p[..., 2] - height) / slope
+        step = (p[..., 2] - height) / slope
+        z = z - step
     return np.asarray(z)

@@ -9,6 +9,10 @@ from typing import Any, Protocol
 from depthba.convert.packages import package
 from depthba.errors import DatasetError, DepthbaError
 
+_MORE = 4
+"""Bytes that RealSense's recorder leaves behind the images of its bags of ROS 1, which the type
+of the message does not have: the unit of depth, a float."""
+
 
 class Store(Protocol):
     """Where messages lie. Times are those of the log, ns."""
@@ -62,7 +66,12 @@ class _Bag:
 
     def _decoded(self, kind: str, data: bytes, topic: str) -> Any:
         try:
-            return self._reader.deserialize(data, kind)
+            try:
+                return self._reader.deserialize(data, kind)
+            except Exception:
+                if not (topic.startswith("/device_") and kind == "sensor_msgs/msg/Image"):
+                    raise
+                return self._reader.deserialize(data[:-_MORE], kind)
         except Exception as error:  # cut off, or not of that type
             raise DatasetError(f"{self._path}: {topic}: {error!r}, expected {kind}") from error
 

@@ -1,9 +1,8 @@
-"""Bags as rosbags, mcap and RealSense's own library write them."""
+"""Bags as rosbags and mcap write them."""
 
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from numpy.testing import assert_allclose
 from depthba import se3
 from depthba.convert import Reading, importing
 from depthba.errors import DatasetError
-from depthba.trajectory import write_tum
 from tests.depthba.convert import small_scene
 from tests.depthba.convert.small_scene import LENS, millimetres, poses
 
@@ -222,51 +220,6 @@ def test_packed_images_are_unpacked(
     assert frame.depth is not None and frame.rgb is not None
     assert_allclose(frame.depth(), small_scene.depth(poses()[4]), rtol=0, atol=loose)
     assert (frame.rgb() == small_scene.colour(4)).all()
-
-
-def test_a_realsense_recording_takes_its_poses_from_a_file(tmp_path: Path) -> None:
-    rs = pytest.importorskip("pyrealsense2")
-    path = tmp_path / "recorded.db3"
-    device = rs.software_device()
-    stereo = device.add_sensor("Stereo")
-    stream = rs.video_stream()
-    stream.type, stream.fmt, stream.uid, stream.bpp = rs.stream.depth, rs.format.z16, 1, 2
-    stream.width, stream.height, stream.fps = 80, 60, 30
-    lens = rs.intrinsics()
-    lens.width, lens.height, lens.model, lens.coeffs = 80, 60, rs.distortion.none, [0.0] * 5
-    lens.fx, lens.fy, lens.ppx, lens.ppy = LENS
-    stream.intrinsics = lens
-    profile = stereo.add_video_stream(stream)
-    stereo.add_read_only_option(rs.option.depth_units, 0.0005)
-    try:
-        recorder = rs.recorder(str(path), device)
-    except RuntimeError as error:
-        pytest.skip(f"this version records other files: {error}")
-    sensor = recorder.query_sensors()[0]
-    sensor.open(profile)
-    sensor.start(rs.frame_queue(10))
-    for k, T in enumerate(poses()):
-        frame = rs.software_video_frame()
-        frame.pixels = millimetres(T, 0.0005)
-        frame.stride, frame.bpp, frame.frame_number, frame.timestamp = 160, 2, k, 1000.0 * k
-        frame.profile, frame.depth_units = profile.as_video_stream_profile(), 0.0005
-        frame.domain = rs.timestamp_domain.hardware_clock
-        stereo.on_video_frame(frame)
-        time.sleep(0.03)  # it drops what comes too fast
-    sensor.stop()
-    sensor.close()
-    del sensor, recorder
-    with pytest.raises(DatasetError, match=r"at rest in .*--poses FILE in TUM format"):
-        importing.read(path, Reading())
-    lasting = tmp_path / "poses.txt"
-    write_tum(lasting, np.array([-1.0, 100.0]), np.tile(np.eye(4), (2, 1, 1)))
-    recording = importing.read(path, Reading(poses=str(lasting), max_gap=200.0, unchecked=True))
-    assert recording.depth_scale == 0.0005
-    assert len(recording.frames) >= 2
-    depths = [frame.depth() for frame in recording.frames if frame.depth is not None]
-    wanted = [small_scene.depth(T) for T in poses()]
-    for z in depths:
-        assert min(float(np.nanmax(np.abs(z - want))) for want in wanted) < 1e-9
 
 
 def test_what_is_no_bag_is_refused_in_a_line(tmp_path: Path) -> None:

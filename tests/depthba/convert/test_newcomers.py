@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from depthba import cli
 from depthba.convert import Reading, importing
 from depthba.dataset import Dataset
-from depthba.errors import DatasetError
+from depthba.errors import DatasetError, OptionError
 from depthba.trajectory import write_tum
 from tests.depthba.convert import small_scene
 from tests.depthba.convert.small_scene import millimetres, poses, write_png
@@ -104,6 +104,18 @@ def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
         ),
         (lines(lambda r: r[1:]), r"7 numbers \(without a stamp\? with angles\?\), expected 8"),
         (lines(lambda r: ["5.0", *r[1:]]), r"poses.txt: 4 poses of stamp 5.000000, expected a"),
+        (
+            lines(lambda r: [r[0], "nan", *r[2:]]),
+            r"line 1: tx is nan, expected a finite number, or no line for a frame without a pose",
+        ),
+        (
+            lambda p: [
+                (p / "depth" / f"day{k}").mkdir()
+                or (p / "depth" / f"{k:06d}.png").rename(p / f"depth/day{k}/{k:06d}.png")
+                for k in range(FRAMES)
+            ],
+            r"depth/day0/000000.png is an image: depth images lie in the folder .*, all in one",
+        ),
         (lambda p: (p / "poses.txt").unlink(), r"files of poses in it: none, .*or --poses FILE"),
         (
             lambda p: shutil.copy(p / "poses.txt", p / "truth.txt"),
@@ -145,6 +157,28 @@ def test_quaternions_with_the_scalar_first_are_read_when_it_is_said(tmp_path: Pa
     convention = recording.convention
     undone = convention.undone(recording.T_world_camera)
     assert_allclose(convention.applied(undone), recording.T_world_camera, rtol=0, atol=1e-12)
+
+
+def test_steps_a_metre_are_not_taken_for_metres_a_step(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"--depth-scale 5000: .* 0.0002 for 5000 steps a metre"):
+        importing.read(bare(tmp_path / "set"), replace(READING, depth_scale=5000.0))
+
+
+def test_one_image_is_no_source(tmp_path: Path) -> None:
+    file = bare(tmp_path / "set") / "depth/000000.png"
+    with pytest.raises(DatasetError, match=r"000000.png: one image, while a source is the folder"):
+        importing.read(file, READING)
+
+
+def test_poses_of_other_frames_are_doubted(tmp_path: Path) -> None:
+    """Whatever convention they are explained by."""
+    path = bare(tmp_path / "set")
+    write_tum(path / "poses.txt", np.arange(float(FRAMES)), poses()[:FRAMES][::-1])
+    try:
+        told = " ".join(importing.read(path, READING).notes)
+    except DatasetError as error:
+        told = str(error)
+    assert "are the poses those of" in told
 
 
 def test_intrinsics_of_another_size_are_noticed(tmp_path: Path) -> None:
