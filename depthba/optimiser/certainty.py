@@ -264,6 +264,7 @@ def assess(
     free: NDArray[np.bool_],
     frame_ids: tuple[int, ...],
     known: Correlation | None = None,
+    doubt: float = 1.0,
 ) -> Certainty:
     """Turn the exact reduced matrix into covariances and a verdict on observability.
 
@@ -280,6 +281,7 @@ def assess(
         frame_ids: ids of the frames.
         known: how the residuals are correlated: what the blocks' gradients scatter beyond the
             variance adds to the covariance.
+        doubt: factor on the variance by which the verdict alone is more careful.
     """
     n = len(free)
     keep = np.repeat(free, 6)
@@ -291,7 +293,8 @@ def assess(
         whole = known.S[np.ix_(keep, keep)]
         scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30) ** 2
         posterior = posterior + posterior @ scatter @ posterior
-    weak = _weak_directions(posterior, held, free, frame_ids, problem)
+    careful = posterior if doubt == 1.0 else np.asarray(np.linalg.inv(data / doubt + held), float)
+    weak = _weak_directions(careful, held, free, frame_ids, problem)
     about_pivots = np.zeros((6 * n, 6 * n))
     # without belief in the prior a trace of it stays, so that open directions are large and not
     # infinite

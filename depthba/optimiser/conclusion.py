@@ -78,7 +78,7 @@ def conclude(
     )  # fmt: skip
     judged = certainty.assess(
         level.problem, state, firm_lin, S, inflation * sigma**2, prior, engine.preset.prior,
-        engine.free, ids, correlation,
+        engine.free, ids, correlation, engine.doubt,
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)

@@ -6,7 +6,7 @@ or a finer map is allowed; and the camera may have a fixed pattern to be taken o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,8 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
     if level.tied:
         # no point vouches twice
         level = engine.patched(level, state, lin, 0.0)
+    if engine.doubted:
+        level = replace(level, tied=None)
     at = engine.with_patches(level, state, lin, at)
     believed = _believed(engine, problem, level.grid, state, loss, lin, at)
     found = certainty.correlation(

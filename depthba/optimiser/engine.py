@@ -40,6 +40,9 @@ SETTLED, PASSING = 0.03, 0.1
 NEAR = 1e-2
 # Share of noise in what the data say of a direction, from which on steps are guarded against it.
 NOISY = 0.1
+# Factor on the variance of what patches alone say from there on, and in the verdict: noise in their
+# slopes, which nothing takes off, slides frames along a bare table.
+CAUTION = 16.0
 # That share grows from a level to the next by less than this.
 FINER = 4.0
 # A spacing below this share of the last one is worth a level of its own.
@@ -84,6 +87,9 @@ class Engine:
     settled: float = SETTLED
     noisy: float = 1.0
     """Largest share of noise in what the data said about a direction, when last measured."""
+    doubted: bool = False
+    """Whether that was much before patches came, and measured poses could say otherwise. Nothing
+    takes noise off the slopes of patches: then they find the poses, but do not vouch for them."""
     history: list[Iteration] = field(default_factory=list)
     bend: NDArray[np.float64] | None = None
     """(m,), m at a point of typical noise: what has been taken off the points; None: nothing."""
@@ -191,24 +197,20 @@ class Engine:
         )
 
     @property
-    def _patches_vouch(self) -> bool:
-        """Whether patches may speak: not where noise in slopes is much of what is known.
-
-        Their slopes are noisy too, and nothing takes that off: they would slide frames along a bare
-        table. Without measured poses there is nothing else to go by.
-        """
-        guarded = self.preset.prior and self.noisy >= NOISY
-        return self.preset.robust > 0 and not guarded
+    def doubt(self) -> float:
+        """Factor on the variance of what the points say, where slopes are doubted; else 1."""
+        return CAUTION if self.doubted else 1.0
 
     def _tied(
         self, poses: NDArray[np.float64], spacing: float, known: certainty.Correlation | None
     ) -> NDArray[np.float64]:
         """Return the poses as patches alone would have them."""
-        if not self._patches_vouch or self.clock.over:
+        if not self.preset.robust or self.clock.over:
             return poses
+        inflation = self.doubt * (known.inflation if known else 1.0)
         poses = tied_by_patches(
-            self.problem, poses, spacing, self.prior, self.acting,
-            known.inflation if known else 1.0, self.free, self.workers,
+            self.problem, poses, spacing, self.prior, self.acting, inflation, self.free,
+            self.workers,
         )  # fmt: skip
         self.clock.lap("patches")
         return poses
@@ -220,7 +222,7 @@ class Engine:
 
         ``shared``: weight of the points there that the map takes at their full weight, too.
         """
-        if not self._patches_vouch:
+        if not self.preset.robust:
             return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
@@ -325,6 +327,8 @@ class Engine:
             level.problem, level.grid, state, level.loss, lin, S, held,
             self.free, self.workers, share=NOISY,
         )  # fmt: skip
+        if level.tied is None:
+            self.doubted = self.noisy >= NOISY
         return None if less is S else less
 
     def _correlation(
