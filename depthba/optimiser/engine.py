@@ -40,11 +40,11 @@ SETTLED, PASSING = 0.03, 0.1
 NEAR = 1e-2
 # Share of noise in what the data say of a direction, from which on steps are guarded against it.
 NOISY = 0.1
-# Factor on the variance of what patches alone say from there on, and in the verdict: noise in their
-# slopes, which nothing takes off, slides frames along a bare table.
-CAUTION = 16.0
 # That share grows from a level to the next by less than this.
 FINER = 4.0
+# Factor on the variance of what patches alone say from that share on, and in the verdict: noise in their
+# slopes, which nothing takes off, slides frames along a bare table.
+CAUTION = 16.0
 # A spacing below this share of the last one is worth a level of its own.
 CLEARLY = 0.9
 
