@@ -42,8 +42,8 @@ NEAR = 1e-2
 NOISY = 0.1
 # That share grows from a level to the next by less than this.
 FINER = 4.0
-# Factor on the variance of what patches alone say from that share on, and in the verdict: noise in their
-# slopes, which nothing takes off, slides frames along a bare table.
+# Factor on the variance of what patches alone say from that share on, and in the verdict: noise in
+# their slopes, which nothing takes off, slides frames along a bare table.
 CAUTION = 16.0
 # A spacing below this share of the last one is worth a level of its own.
 CLEARLY = 0.9
