@@ -289,11 +289,12 @@ def assess(
     data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
     held = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
     posterior = np.asarray(np.linalg.inv(data + held), float)
+    careful = np.asarray(np.linalg.inv(data / doubt + held), float)
     if known is not None and keep.any():
         whole = known.S[np.ix_(keep, keep)]
         scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30) ** 2
-        posterior = posterior + posterior @ scatter @ posterior
-    careful = posterior if doubt == 1.0 else np.asarray(np.linalg.inv(data / doubt + held), float)
+        beyond = posterior @ scatter @ posterior
+        posterior, careful = posterior + beyond, careful + beyond
     weak = _weak_directions(careful, held, free, frame_ids, problem)
     about_pivots = np.zeros((6 * n, 6 * n))
     # without belief in the prior a trace of it stays, so that open directions are large and not

@@ -138,11 +138,11 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
         problem = without_bends(problem, level.grid, state.heights, state.T_map_camera)
     lin = linearise(problem, level.grid, state, loss, workers, level.smooth)
     at = reduced.reduce(lin, workers, free=engine.free)
-    if level.tied:
-        # no point vouches twice
-        level = engine.patched(level, state, lin, 0.0)
     if engine.doubted:
         level = replace(level, tied=None)
+    elif level.tied:
+        # no point vouches twice
+        level = engine.patched(level, state, lin, 0.0)
     at = engine.with_patches(level, state, lin, at)
     believed = _believed(engine, problem, level.grid, state, loss, lin, at)
     found = certainty.correlation(
