@@ -24,35 +24,6 @@ from depthba.result import WeakDirection
 # A direction is weak when more than this share of what is known about it comes from the measured
 # pose.
 WEAK = 0.2
-# Points of a frame that its noise is measured on.
-SAMPLE = 5000
-# Leverage above which a residual says nothing about its point's noise.
-FOLLOWED = 0.7
-
-
-def noise_sigma(
-    problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation
-) -> float:
-    """Return the robust standard deviation of the points' noise, m.
-
-    A map with few points on a node follows them, so that their residuals are smaller than their
-    noise: each is divided by the root of what its leverage leaves (the externally known part of a
-    studentised residual, Cook & Weisberg 1982).
-    """
-    ground = Ground(problem, grid, state, loss)
-    found = []
-    for i, frame in enumerate(problem.frames):
-        stride = max(1, len(frame) // SAMPLE)
-        feet, some = ground.feet(i, stride), frame.points[::stride]
-        pull = np.empty(len(some))
-        probes.leverages(
-            some, feet.on, feet.cells, feet.fractions, feet.norm2, lin.weights[i][::stride],
-            lin.C.own, pull,
-        )  # fmt: skip
-        free = pull < FOLLOWED
-        found.append(np.abs(lin.residuals[i][::stride][free]) / np.sqrt(1.0 - pull[free]))
-    each = np.concatenate(found)
-    return float(1.4826 * np.median(each)) if len(each) else robust_sigma(lin.residuals)
 
 
 @dataclass(frozen=True)

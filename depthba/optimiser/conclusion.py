@@ -11,6 +11,7 @@ from depthba.optimiser.ending import Known, known_at
 from depthba.optimiser.engine import End, Engine
 from depthba.optimiser.grid import average, filled
 from depthba.optimiser.linearise import State, linearise, robust_sigma
+from depthba.optimiser.noise import noise_sigma
 from depthba.optimiser.reporting import astray, depth_map, frame_reports, misfits, verdict
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.solver import solve_map
@@ -67,7 +68,7 @@ def conclude(
     found = known if better else None
     found = found or known_at(engine, level, state, outcome.loss)
     firm, firm_lin, correlation = found.problem, found.lin, found.correlation
-    sigma = certainty.noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
+    sigma = noise_sigma(firm, level.grid, state, outcome.loss, firm_lin)
     # where no point may vouch for the map, all must; and none is better than its last digit
     sigma = max(sigma or robust_sigma(lin.residuals), problem.rounding)
     variance, inflation = correlation.inflation * sigma**2, found.inflation

@@ -13,6 +13,7 @@ from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level, level_heights, make_level
 from depthba.optimiser.linearise import Linearisation, State, robust_sigma
+from depthba.optimiser.noise import ByRange, by_range
 from depthba.optimiser.prior import PosePrior
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
@@ -45,6 +46,8 @@ FINER = 4.0
 # Factor on the variance of what patches alone say from that share on, and in the verdict: noise in
 # their slopes, which nothing takes off, slides frames along a bare table.
 CAUTION = 16.0
+# Factor on the noise at some range, from which on it is worth to settle anew.
+NOTICEABLE = 1.2
 # A spacing below this share of the last one is worth a level of its own.
 CLEARLY = 0.9
 
@@ -149,8 +152,10 @@ class Engine:
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
-                if level.tied:
-                    # where the poses have got to, patches lie better
+                shown = self._shown(level, outcome)
+                if level.tied or shown.wrong > NOTICEABLE:
+                    # where the poses have got to, patches lie better and points show their noise
+                    level = self.weighed(level, shown)
                     return self.settle(level, state, lin, index, known)
                 return End(level, outcome, temperature, index, believed)
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
@@ -170,6 +175,17 @@ class Engine:
         )
         self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature, index, known.inflation if known else 1.0)
+
+    def _shown(self, level: Level, outcome: Outcome) -> ByRange:
+        """Return how the noise over the range differs from the one reckoned with."""
+        if not self.preset.robust or self.clock.over:
+            return ByRange.as_stated()
+        return by_range(level.problem, level.grid, outcome.state, outcome.loss, outcome.lin)
+
+    def weighed(self, level: Level, shown: ByRange) -> Level:
+        """Take all points for as noisy as was shown; return the level with its points likewise."""
+        self.problem = shown.applied(self.problem)
+        return replace(level, problem=shown.applied(level.problem))
 
     def unbent(self, level: Level, bend: NDArray[np.float64]) -> Level:
         """Take the camera's fixed pattern (m,) off all points, in place of the present one.

@@ -67,6 +67,24 @@ def looking_down(count: int, rng: np.random.Generator, tilt: float = 0.2) -> Flo
     return T
 
 
+def flat_case(
+    count: int, near: float = 0.001, far: float = 0.001, frames: int = 2
+) -> tuple[Floats, list[Floats]]:
+    """Frames over a plane with noise along z, m: poses, clouds (n, 5).
+
+    Every second camera is half as far away, where the noise is that ``near``.
+    """
+    rng = np.random.default_rng(4)
+    T = looking_down(frames, rng, tilt=0.0)
+    T[::2, 2, 3] *= 1.0 if near == far else 0.5
+    clouds = []
+    for i, pose in enumerate(T):
+        xy = rng.uniform(-0.3, 0.3, (count, 2))
+        q = np.column_stack([xy, (far if i % 2 else near) * rng.standard_normal(count)])
+        clouds.append(np.column_stack([(q - pose[:3, 3]) @ pose[:3, :3], np.ones((count, 2))]))
+    return T, clouds
+
+
 def view(
     T: Floats, surface: Callable[[Floats, Floats], Floats], count: int, rng: np.random.Generator
 ) -> Floats:

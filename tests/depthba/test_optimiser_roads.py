@@ -7,19 +7,17 @@ import pytest
 
 from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.bends import without_bends
-from depthba.optimiser.certainty import beyond_scalar, noise_sigma
+from depthba.optimiser.certainty import beyond_scalar
 from depthba.optimiser.eliminate import Step
 from depthba.optimiser.grid import Grid
-from depthba.optimiser.linearise import Linearisation, Loss, State, linearise
+from depthba.optimiser.linearise import Linearisation, linearise
 from depthba.optimiser.mixing import Mixer
-from depthba.optimiser.solver import solve_map
 from depthba.optimiser.stencil import MapSolver, Stencil
 from depthba.optimiser.workers import Workers
 from tests.depthba.optimiser_problems import (
     ROBUST,
-    Floats,
     awkward_case,
-    looking_down,
+    flat_case,
     problem_of,
 )
 
@@ -120,31 +118,6 @@ def test_mixing_ends_a_linear_process_early() -> None:
         mixer.took(mixed)
         x = x + mixed.pose.ravel()
     assert np.linalg.norm(x - goal) < 0.1 * 0.8**12 * np.linalg.norm(goal)
-
-
-def flat_case(count: int) -> tuple[Floats, list[Floats]]:
-    """Frames over a plane with noise of 1 mm along z: poses, clouds (n, 5)."""
-    rng = np.random.default_rng(4)
-    T = looking_down(2, rng, tilt=0.0)
-    clouds = []
-    for pose in T:
-        xy = rng.uniform(-0.3, 0.3, (count, 2))
-        q = np.column_stack([xy, 0.001 * rng.standard_normal(count)])
-        clouds.append(np.column_stack([(q - pose[:3, 3]) @ pose[:3, :3], np.ones((count, 2))]))
-    return T, clouds
-
-
-@pytest.mark.parametrize("per_node", [2, 6, 30])
-def test_noise_is_told_although_the_map_follows_the_points(per_node: int) -> None:
-    spacing = 0.02
-    T, clouds = flat_case(int(per_node / 2 * (0.6 / spacing) ** 2))
-    problem, grid = problem_of(clouds, T), Grid(np.array([-0.44, -0.44]), spacing, (45, 45))
-    loss = Loss(False, True, 0.0, 2 * spacing, 0.0, 1e-3)
-    smooth = np.ones(grid.shape, bool)
-    state, lin = solve_map(
-        problem, grid, State(T, np.zeros(grid.shape)), loss, smooth, Workers(1), 2, 1e-8
-    )
-    assert noise_sigma(problem, grid, state, loss, lin) == pytest.approx(0.001, rel=0.1)
 
 
 def test_points_at_a_step_are_left_out_and_no_others() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from depthba.optimiser import certainty, coupling, reduced
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
+from depthba.optimiser.noise import noise_sigma
 from depthba.optimiser.problem import BLOCKS
 from depthba.optimiser.slope_noise import without_slope_noise
 from depthba.optimiser.workers import Workers
@@ -219,7 +220,7 @@ def _weigh(
         )
         for f in level.problem.frames
     ]
-    sigma = certainty.noise_sigma(level.problem, level.grid, state, loss, lin)
+    sigma = noise_sigma(level.problem, level.grid, state, loss, lin)
     variance = sigma**2 * robust_excess(lin, loss, sigma)
     everywhere = np.ones(n, bool)
     scores = certainty.block_scores(
