@@ -112,7 +112,7 @@ def residuals_picture(result: BoardHandEye, path: str | Path) -> None:
     outside = int((np.abs(e) > reach).any(axis=1).sum())
     cloud.set_title(
         f"sigma {noise.corner:.3f} px (rings: 1 and 3)"
-        + (f", {outside} outside" if outside else ""),
+        + (f", {outside} beyond the edge" if outside else ""),
         fontsize=10,
     )
     cloud.set_xlabel("u (px)")
