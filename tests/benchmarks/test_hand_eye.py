@@ -77,7 +77,7 @@ def test_algebraic_solver_on_kinhec(benchmark: BenchmarkFixture, tmp_path: Path)
     from kinhec.io import _load_from_row
 
     words = [sys.executable, "-m", "kinhec", "generate", "--tier", "smoke", "--out", str(tmp_path)]
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, cwd=tmp_path)
     errors: dict[str, list[tuple[float, float]]] = {}
 
     def run() -> None:
