@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from depthba import __version__
 from depthba.convert import files, overlap, registry
 from depthba.convert.reading import Reading
-from depthba.convert.recording import Recording, SourceFrame, count
+from depthba.convert.recording import Recording, SourceFrame
 from depthba.dataset import Dataset, DatasetWriter, is_dataset
 from depthba.dataset.sensor import DEPTH_LARGEST
 from depthba.errors import DatasetError, OptionError
+from depthba.words import count
 
 __all__ = ["Imported", "into_dataset", "is_dataset", "read"]
 

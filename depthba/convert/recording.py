@@ -14,6 +14,7 @@ from depthba import se3
 from depthba.camera import Camera
 from depthba.convert.reading import Axes, Direction, Quaternions, Reading
 from depthba.errors import DatasetError
+from depthba.words import count
 
 if TYPE_CHECKING:
     from depthba.dataset import Dataset
@@ -168,11 +169,6 @@ def rigid(T: Array, name: str) -> Array:
         return T
     U, _, Vt = np.linalg.svd(T[:3, :3])
     return se3.make(U @ Vt, T[:3, 3])
-
-
-def count(number: int, what: str) -> str:
-    """Return such as "1 frame" or "3 frames"."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def left_out(names: Iterable[str], why: str) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from depthba.optimiser.linearise import Linearisation, State
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.solver import Outcome, Progress
 from depthba.result import FrameReport, Iteration, Status
+from depthba.words import count
 
 # Standard deviations of a measured pose, as they were stated and as they are supposed where nobody
 # stated any, beyond which pose and points contradict each other.
@@ -77,8 +78,8 @@ def verdict(
         parts = [f"frame {f.frame} was held: {f.held}" for f in starved]
         if weak:
             parts.append(
-                f"the data leave {len(judged.weak)} directions of {len(weak)} frames "
-                "to the measured poses"
+                f"the data leave {count(len(judged.weak), 'direction')} of "
+                f"{count(len(weak), 'frame')} to the measured poses"
             )
         return "weak", "; ".join(parts + gone)
     if not outcome.converged and clock.over:

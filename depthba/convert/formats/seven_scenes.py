@@ -16,10 +16,11 @@ from depthba import durable
 from depthba.camera import Camera
 from depthba.convert import files, intrinsics, pose_files
 from depthba.convert.reading import Reading
-from depthba.convert.recording import Format, Recording, SourceFrame, count, left_out
+from depthba.convert.recording import Format, Recording, SourceFrame, left_out
 from depthba.convert.writing import camera_of, depth_pixels, each, new_folder, write_png
 from depthba.dataset import Dataset
 from depthba.errors import DatasetError
+from depthba.words import count
 
 Array = NDArray[np.float64]
 
