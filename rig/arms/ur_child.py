@@ -2,8 +2,8 @@
 
 The library's constructors and some of its calls may block for ever and keep the interpreter from
 running anything else, so they live in a process of their own that can be ended. It reads requests
-from stdin and answers on stdout, one JSON object a line. When its stdin closes, it brakes the arm
-and ends; what hangs is ended from within by a timer that needs no interpreter.
+from stdin and answers on stdout, one JSON object a line. When either closes, it brakes the arm and
+ends; what hangs is ended from within by a timer that needs no interpreter.
 """
 
 from __future__ import annotations
@@ -137,7 +137,10 @@ def main() -> None:
                 answer["value"] = doers[request["do"]](**request["arguments"])
         except Exception as error:  # whatever the library throws is for the parent to judge
             answer["error"] = " ".join(str(error).split())
-        print(json.dumps(answer), file=answers, flush=True)
+        try:
+            print(json.dumps(answer), file=answers, flush=True)
+        except OSError:  # who asked died while it was done: the arm may move all the same
+            break
     # Nobody is there to be told any more, whatever the library throws.
     with contextlib.suppress(Exception), _ended_after(_LEAVING):
         client.leave()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import signal
 import socket
@@ -275,6 +276,36 @@ def test_an_arm_whose_program_is_killed_brakes(running: Running, arm: UrArm) -> 
         for process in alive:
             process.kill()
         assert len(gone) == 1
+    truth = running.truth()
+    assert not truth["moving"] and truth["encoders"][0] < READY[0] + 2.0
+
+
+def test_an_arm_whose_program_dies_before_it_is_answered_brakes(
+    running: Running, arm: UrArm
+) -> None:
+    arm.disconnect()
+    with subprocess.Popen(
+        [sys.executable, "-m", "rig.arms.ur_child"],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as child:
+        assert child.stdin is not None and child.stdout is not None
+
+        def ask(number: int, do: str, **arguments: object) -> None:
+            assert child.stdin is not None
+            request = {"number": number, "do": do, "limit": 60.0, "arguments": arguments}
+            child.stdin.write(json.dumps(request) + "\n")
+            child.stdin.flush()
+
+        ask(0, "connect", host=running.host, frequency=125.0, upper_registers=False)
+        assert json.loads(child.stdout.readline())["value"]
+        goal = np.add(READY, [2.5, 0, 0, 0, 0, 0]).tolist()
+        child.stdout.close()
+        ask(1, "move_joints", joints=goal, speed=0.3, acceleration=1.0)
+        assert child.wait(20.0) == 0
     truth = running.truth()
     assert not truth["moving"] and truth["encoders"][0] < READY[0] + 2.0
 
