@@ -185,7 +185,10 @@ def _scalar(value: Any, hint: Any, folder: Path) -> Any:
     if hint is float:
         return _number(value)
     if hint is Path and isinstance(value, str):
-        return (folder / Path(value).expanduser()).resolve()
+        try:
+            return (folder / Path(value).expanduser()).resolve()
+        except (ValueError, RuntimeError, OSError):  # no name of a file; a home of nobody
+            raise _Misfit from None
     if hint in (None, type(None)) and value is None:
         return None
     wrong = isinstance(value, bool) and hint is not bool

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tests.fuzz.child import DEADLINE
@@ -58,6 +59,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="for each target")
     parser.add_argument("--seed", type=int, help="None: by the clock")
     parser.add_argument("--keep", type=Path, default=ROOT / "logs" / "fuzz")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="targets at once")
     told = "own: mutations of structure; atheris: guided by coverage"
     parser.add_argument("--driver", choices=("both", "own", "atheris"), default="both", help=told)
     asked = parser.parse_args()
@@ -68,15 +70,22 @@ def main() -> int:
     drivers: tuple[tuple[str, ...], ...] = ((), ("--atheris",))
     if asked.driver != "both" or not guided:
         drivers = (("--atheris",),) if asked.driver == "atheris" else ((),)
-    failed = []
-    print(f"seed {seed}, {asked.minutes:g} min a target, faults in {asked.keep}", flush=True)
-    for name in asked.targets or names():
+    seconds = 60.0 * asked.minutes / len(drivers)
+
+    def fuzzed(name: str) -> bool:
+        faulty = False
         for words in drivers:
-            seconds = 60.0 * asked.minutes / len(drivers)
             said = fuzz(name, seconds, seed, asked.keep.resolve(), words)
             print(f"{name}{' guided' if words else ''}: {' '.join(said.split()) or 'sound'}",
                   flush=True)  # fmt: skip
-            failed += [name] if '"fault":' in said else []
+            faulty |= '"fault":' in said
+        return faulty
+
+    chosen = asked.targets or names()
+    print(f"seed {seed}, {asked.minutes:g} min a target, faults in {asked.keep}", flush=True)
+    with ThreadPoolExecutor(asked.workers) as pool:
+        faults = pool.map(fuzzed, chosen)
+        failed = [name for name, faulty in zip(chosen, faults, strict=True) if faulty]
     print(f"{len(failed)} of the targets went wrong: {' '.join(failed)}" if failed else "all sound")
     return 1 if failed else 0
 

@@ -51,7 +51,9 @@ class Place:
     def judge(self, data: bytes) -> str:
         """Return what was wrong with how an input was read; "" where nothing was."""
         self.target.place(self.folder, data)
-        fault = self._judge.judge(lambda: self.target.read(self.folder), self.folder, len(data))
+        fault = self._judge.judge(
+            lambda: self.target.read(self.folder), self.folder, len(data), self.target.trusted
+        )
         if self.target.writes:
             self._renew()
         return fault

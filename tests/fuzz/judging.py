@@ -49,13 +49,16 @@ class Judge:
         )  # fmt: skip
         sys.addaudithook(self._heard)
 
-    def judge(self, read: Callable[[], object], folder: Path, size: int) -> str:
+    def judge(
+        self, read: Callable[[], object], folder: Path, size: int, anywhere: bool = False
+    ) -> str:
         """Return what went wrong while an input of ``size`` bytes was read; "" where nothing did.
 
         Args:
             read: reads the input; may raise what `depthba` would print in one line.
             folder: the only one whose files may be opened.
             size: bytes of the input.
+            anywhere: files elsewhere may be opened, too.
         """
         self._judged += 1
         if self._judged % 100 == 0:  # each time would take longer than reading
@@ -80,7 +83,7 @@ class Judge:
             fault = _described(error)
         finally:
             faulthandler.cancel_dump_traceback_later()
-        if self._strayed:
+        if self._strayed and not anywhere:
             fault += f" opened {self._strayed[:3]}"
         return fault
 

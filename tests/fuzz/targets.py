@@ -35,6 +35,8 @@ class Target:
     """Puts an input into the folder. None: it is written where the file was."""
     writes: bool = False
     """Whether reading changes the folder, so that each input needs a new one."""
+    trusted: bool = False
+    """Whether the file may name files anywhere, as what a user writes himself does."""
 
     def place(self, folder: Path, data: bytes) -> None:
         """Put an input in its place."""
@@ -346,8 +348,8 @@ def _calibration(file: str) -> Callable[[Path], object]:
 
 
 _SESSION = (
-    Target("session", sessions, "session.yaml", read_session, mutating.of_yaml),
-    Target("session-gantry", _gantry, "session.yaml", read_session, mutating.of_yaml),
+    Target("session", sessions, "session.yaml", read_session, mutating.of_yaml, trusted=True),
+    Target("session-gantry", _gantry, "session.yaml", read_session, mutating.of_yaml, trusted=True),
     Target("session-hand-eye", sessions, "hand_eye.json", read_session, mutating.of_json),
     Target("session-taught", sessions, "taught.txt", _read_taught, mutating.of_text),
     Target("hand-eye", _record, "hand_eye.json", _read_record, mutating.of_json),
