@@ -119,6 +119,8 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
             return end, there
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
+        # where nothing but the measured poses' weight changes, patches lie as well as they can
+        tied = None if bent or finer < level.grid.spacing else outcome.tied
         if bent and there.believed is not None:
             before = _on_trial(engine, end, there)
             level = engine.unbent(level, trail.next(engine.bend, there.believed.pattern))
@@ -127,7 +129,7 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
             index += 1
             coarse = Map(state.heights, level.grid)
             level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
-        end = engine.settle(level, state, lin, index, known)
+        end = engine.settle(level, state, lin, index, known, tied)
     return end, None
 
 

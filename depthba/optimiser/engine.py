@@ -14,6 +14,7 @@ from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level, level_heights, make_level
 from depthba.optimiser.linearise import Linearisation, State, robust_sigma
 from depthba.optimiser.noise import ByRange, by_range
+from depthba.optimiser.patches import Fit
 from depthba.optimiser.prior import PosePrior
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.reporting import iteration
@@ -165,10 +166,14 @@ class Engine:
 
     def settle(
         self, level: Level, state: State, lin: Linearisation, index: int,
-        known: certainty.Correlation | None,
+        known: certainty.Correlation | None, tied: Fit | None = None,
     ) -> End:  # fmt: skip
-        """Lay patches anew beside the last level's map, and settle on both."""
-        level, phase = self.patched(level, state, lin), phases(1, self.preset)[-1]
+        """Settle on the last level's map, and on patches beside it, which are laid anew.
+
+        ``tied``: keep these.
+        """
+        level = replace(level, tied=tied) if tied else self.patched(level, state, lin)
+        phase = phases(1, self.preset)[-1]
         near = reduced.reduce(lin, self.workers, NEAR, self.free)
         temperature, outcome = self._descend(
             level, state, lin, near, phase, index, index + 1, known, True

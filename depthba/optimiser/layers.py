@@ -39,7 +39,7 @@ def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: 
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         points = frame.points.copy()
-        a = _look_up(factor, frame.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid)
+        a = _look_up(factor, frame.points, T, grid)
         points[:, 3] *= a
         # what a rough cell scatters is not noise but bias: it gets less than the weight of its
         # variance
@@ -54,7 +54,7 @@ def rough_points(
     """Say of each frame, (n,), which of its points lie in cells that one height cannot describe."""
     rough, grid = roughness(problem, T_map_camera, spacing)
     return [
-        _look_up(rough, f.points[:, :3] @ T[:2, :3].T + T[:2, 3], grid) > 1.0
+        _look_up(rough, f.points, T, grid) > 1.0
         for f, T in zip(problem.frames, T_map_camera, strict=True)
     ]
 
@@ -93,12 +93,12 @@ def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
 
 
 def _look_up(
-    field: NDArray[np.float64], xy: NDArray[np.float64], grid: Grid
+    field: NDArray[np.float64], points: NDArray[np.float32], T: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.float64]:
     """Return the field's value at the node nearest to each point; 1 off the grid."""
     look()
-    k = np.rint((xy - grid.origin) / grid.spacing).astype(int)
-    on = ((k >= 0) & (k < [grid.shape[1], grid.shape[0]])).all(axis=1)
-    out = np.ones(len(xy))
-    out[on] = field[k[on, 1], k[on, 0]]
+    out = np.empty(len(points))
+    map_kernels.look_up(
+        points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, field, out
+    )
     return out

@@ -102,6 +102,19 @@ def splat(points, R, t, origin, spacing, total, count):
 
 
 @nb.njit(cache=True, nogil=True)
+def look_up(points, R, t, origin, spacing, field, out):
+    """Write to ``out`` (n,) the field's value at the node nearest to each point; 1 off the grid."""
+    ny, nx = field.shape
+    for k in range(points.shape[0]):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        qx = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
+        qy = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
+        x = int(np.floor((qx - origin[0]) / spacing + 0.5))
+        y = int(np.floor((qy - origin[1]) / spacing + 0.5))
+        out[k] = field[y, x] if 0 <= x < nx and 0 <= y < ny else 1.0
+
+
+@nb.njit(cache=True, nogil=True)
 def splat_residuals(points, R, t, origin, spacing, nodes, total, squares, count):
     """Add the points' vertical distances from the map to the nodes nearest to them.
 

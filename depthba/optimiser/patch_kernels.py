@@ -7,7 +7,8 @@ noise. It lies off by the way times ``n . ray``, whose variance is the range's t
 ``norm2 = (n . ray)^2 + eps |n|^2``; eps is for noise across the ray.
 
 Points are sorted by patch and, within one, by frame: such a run of points is a *view*. All kernels
-take patches ``first`` to ``last``, so that they can be dealt out over threads.
+take patches ``first`` to ``last``, so that they can be dealt out over threads. The points of a
+patch go through together, one stage for all of them after the other, as in `kernels`.
 """
 
 from __future__ import annotations
@@ -16,69 +17,183 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from depthba.optimiser.kernels import FAST
+
 TERMS = 6
 """Coefficients of a surface."""
 # Share of the noise that is across the ray, squared.
 ACROSS = 0.05
 # Least cosine between ray and normal with which a point is walked.
 GRAZING = 0.15
+# Rows of a patch's points: where they lie; their rays; weights; feet, the slopes there; how far the
+# points lie off, and how much they count for it.
+HEIGHT, U, V, RAY_0, RAY_1, RAY_2, WEIGHT, FOOT_0, FOOT_U, FOOT_V = range(10)
+SLOPE_U, SLOPE_V, NORM2, OFF, COUNTS = range(10, 15)
+ROWS = 15
+# Columns of a view's sums: what its pose and the surface change, and how far points lie off; a
+# whole number of vector registers.
+POSE, SURFACE, ERROR, COLUMNS = 0, 6, 12, 16
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
-def _meet(p, Q, o, q, rays, reach, at):
-    """Walk a point to its surface.
+@nb.njit(cache=True, nogil=True)
+def _room(first, last, ends, views):
+    """Return memory for the points of any of the patches."""
+    most = 0
+    for k in range(first, last):
+        most = max(most, ends[views[k + 1]] - ends[views[k]])
+    return np.empty((ROWS, most))
 
-    Writes to ``at``: v, u and y of the foot, n_1 and n_2 (n_0 is 1), and norm2. Returns how far the
-    point lies off.
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _turn_view(points, weights, Q, o, rays, s, at):
+    """Bring the points of a view into the axes of their patch, to columns from ``at`` on."""
+    q00, q01, q02 = Q[0, 0], Q[0, 1], Q[0, 2]
+    q10, q11, q12 = Q[1, 0], Q[1, 1], Q[1, 2]
+    q20, q21, q22 = Q[2, 0], Q[2, 1], Q[2, 2]
+    o0, o1, o2 = o[0], o[1], o[2]
+    n = len(points)
+    y, u, v, w = s[HEIGHT, at:], s[U, at:], s[V, at:], s[WEIGHT, at:]
+    a0, a1, a2 = s[RAY_0, at:], s[RAY_1, at:], s[RAY_2, at:]
+    for i in range(n):
+        p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
+        r0 = q00 * p0 + q01 * p1 + q02 * p2
+        r1 = q10 * p0 + q11 * p1 + q12 * p2
+        r2 = q20 * p0 + q21 * p1 + q22 * p2
+        y[i], u[i], v[i], w[i] = r0 + o0, r1 + o1, r2 + o2, weights[i]
+        a0[i], a1[i], a2[i] = r0, r1, r2
+    if rays:
+        for i in range(n):
+            shorter = 1.0 / np.sqrt(a0[i] * a0[i] + a1[i] * a1[i] + a2[i] * a2[i])
+            a0[i] *= shorter
+            a1[i] *= shorter
+            a2[i] *= shorter
+
+
+@nb.njit(cache=True, nogil=True)
+def _place(k, points, weights, ends, views, Q, o, rays, s):
+    """Bring the points of a patch into its axes; return how many they are."""
+    begin = ends[views[k]]
+    for m in range(views[k], views[k + 1]):
+        i, j = ends[m], ends[m + 1]
+        _turn_view(points[i:j], weights[i:j], Q[m], o[m], rays, s, i - begin)
+    return ends[views[k + 1]] - begin
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _meet(n, q, rays, reach, s):
+    """Walk the points of a patch to its surface: feet, slopes there, norms, how far they lie off.
+
+    What the walk has not covered is left over at its end.
     """
-    r0 = Q[0, 0] * p[0] + Q[0, 1] * p[1] + Q[0, 2] * p[2]
-    r1 = Q[1, 0] * p[0] + Q[1, 1] * p[1] + Q[1, 2] * p[2]
-    r2 = Q[2, 0] * p[0] + Q[2, 1] * p[1] + Q[2, 2] * p[2]
-    y, u, v = r0 + o[0], r1 + o[1], r2 + o[2]
+    c0, c1, c2, c3, c4, c5 = q[0], q[1], q[2], q[3], q[4], q[5]
+    ys, us, vs = s[HEIGHT], s[U], s[V]
+    a0, a1, a2 = s[RAY_0], s[RAY_1], s[RAY_2]
+    f0, fu, fv = s[FOOT_0], s[FOOT_U], s[FOOT_V]
+    su, sv, norm2, off = s[SLOPE_U], s[SLOPE_V], s[NORM2], s[OFF]
     if not rays:
-        n1 = -(q[1] + 2.0 * q[3] * u + q[4] * v)
-        n2 = -(q[2] + q[4] * u + 2.0 * q[5] * v)
-        at[0], at[1], at[2], at[3], at[4] = y, u, v, n1, n2
-        at[5] = 1.0 + n1 * n1 + n2 * n2
-        return y - (q[0] + u * (q[1] + q[3] * u + q[4] * v) + v * (q[2] + q[5] * v))
-    length = np.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
-    r0, r1, r2 = r0 / length, r1 / length, r2 / length
-    way = 0.0
+        for i in range(n):
+            y, u, v = ys[i], us[i], vs[i]
+            n1 = -(c1 + 2.0 * c3 * u + c4 * v)
+            n2 = -(c2 + c4 * u + 2.0 * c5 * v)
+            f0[i], fu[i], fv[i], su[i], sv[i] = y, u, v, n1, n2
+            norm2[i] = 1.0 + n1 * n1 + n2 * n2
+            off[i] = y - (c0 + u * (c1 + c3 * u + c4 * v) + v * (c2 + c5 * v))
+        return
+    for i in range(n):
+        f0[i], fu[i], fv[i] = ys[i], us[i], vs[i]
+        off[i] = 0.0
     for _ in range(2):
-        fu, fv = u + way * r1, v + way * r2
-        n1 = -(q[1] + 2.0 * q[3] * fu + q[4] * fv)
-        n2 = -(q[2] + q[4] * fu + 2.0 * q[5] * fv)
-        cosine = r0 + n1 * r1 + n2 * r2
-        n = np.sqrt(1.0 + n1 * n1 + n2 * n2)
-        if abs(cosine) < GRAZING * n:
-            cosine = GRAZING * n if cosine > 0.0 else -GRAZING * n
-        e = y + way * r0 - (q[0] + fu * (q[1] + q[3] * fu + q[4] * fv) + fv * (q[2] + q[5] * fv))
-        way = min(max(way - e / cosine, -reach), reach)
-    fu, fv = u + way * r1, v + way * r2
-    n1 = -(q[1] + 2.0 * q[3] * fu + q[4] * fv)
-    n2 = -(q[2] + q[4] * fu + 2.0 * q[5] * fv)
-    cosine = r0 + n1 * r1 + n2 * r2
-    e = y + way * r0 - (q[0] + fu * (q[1] + q[3] * fu + q[4] * fv) + fv * (q[2] + q[5] * fv))
-    at[0], at[1], at[2], at[3], at[4] = y + way * r0, fu, fv, n1, n2
-    at[5] = cosine * cosine + ACROSS * (1.0 + n1 * n1 + n2 * n2)
-    # what the walk has not covered is left over at its end
-    return e - way * cosine
+        for i in range(n):
+            y, u, v = f0[i], fu[i], fv[i]
+            r0, r1, r2 = a0[i], a1[i], a2[i]
+            n1 = -(c1 + 2.0 * c3 * u + c4 * v)
+            n2 = -(c2 + c4 * u + 2.0 * c5 * v)
+            cosine = r0 + n1 * r1 + n2 * r2
+            least = GRAZING * np.sqrt(1.0 + n1 * n1 + n2 * n2)
+            steep = cosine if abs(cosine) > least else (least if cosine > 0.0 else -least)
+            e = y - (c0 + u * (c1 + c3 * u + c4 * v) + v * (c2 + c5 * v))
+            way = off[i] - e / steep
+            way = way if way < reach else reach
+            way = way if way > -reach else -reach
+            off[i] = way
+            f0[i], fu[i], fv[i] = ys[i] + way * r0, us[i] + way * r1, vs[i] + way * r2
+    for i in range(n):
+        y, u, v = f0[i], fu[i], fv[i]
+        n1 = -(c1 + 2.0 * c3 * u + c4 * v)
+        n2 = -(c2 + c4 * u + 2.0 * c5 * v)
+        cosine = a0[i] + n1 * a1[i] + n2 * a2[i]
+        e = y - (c0 + u * (c1 + c3 * u + c4 * v) + v * (c2 + c5 * v))
+        su[i], sv[i] = n1, n2
+        norm2[i] = cosine * cosine + ACROSS * (1.0 + n1 * n1 + n2 * n2)
+        off[i] = e - off[i] * cosine
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
-def _weight(w, e, c2):
-    """Geman-McClure weight of a residual, times that of its point; c2 of 0: no robust loss."""
-    if c2 == 0.0:
-        return w
-    share = c2 / (c2 + w * e * e)
-    return w * share * share
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _weigh(n, square, s):
+    """Say how much points count: Geman-McClure of squared scale, m^2; 0: no robust loss."""
+    weight, norm2, off, counts = s[WEIGHT], s[NORM2], s[OFF], s[COUNTS]
+    if square == 0.0:
+        for i in range(n):
+            counts[i] = weight[i] / norm2[i]
+        return
+    for i in range(n):
+        w = weight[i] / norm2[i]
+        share = square / (square + w * off[i] * off[i])
+        counts[i] = w * share * share
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
-def _terms(phi, u, v):
-    phi[0] = 1.0
-    phi[1], phi[2] = u, v
-    phi[3], phi[4], phi[5] = u * u, u * v, v * v
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _charge(n, square, s, out):
+    """Return what the points cost, m^2; how far they lie off goes to ``out``."""
+    weight, norm2, off = s[WEIGHT], s[NORM2], s[OFF]
+    total = 0.0
+    for i in range(n):
+        e = np.sqrt(weight[i] / norm2[i]) * off[i]
+        out[i] = e
+        total += e * e if square == 0.0 else square * e * e / (square + e * e)
+    return total
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _surface_sums(n, s, M, b):
+    """Sum what points say of a surface: M (6, 6), its lower triangle, and b (6,).
+
+    Products of terms are powers of u and v, of which there are fewer.
+    """
+    us, vs, off, counts = s[FOOT_U], s[FOOT_V], s[OFF], s[COUNTS]
+    m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = 0.0
+    m40 = m31 = m22 = m13 = m04 = b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for i in range(n):
+        u, v, w, e = us[i], vs[i], counts[i], off[i]
+        wu, wv = w * u, w * v
+        wuu, wuv, wvv = wu * u, wu * v, wv * v
+        uu, uv, vv = u * u, u * v, v * v
+        m00 += w
+        m10 += wu
+        m01 += wv
+        m20 += wuu
+        m11 += wuv
+        m02 += wvv
+        m30 += wuu * u
+        m21 += wuu * v
+        m12 += wuv * v
+        m03 += wvv * v
+        m40 += wuu * uu
+        m31 += wuu * uv
+        m22 += wuu * vv
+        m13 += wuv * vv
+        m04 += wvv * vv
+        b0 += w * e
+        b1 += wu * e
+        b2 += wv * e
+        b3 += wuu * e
+        b4 += wuv * e
+        b5 += wvv * e
+    M[0, 0], M[1, 0], M[1, 1], M[2, 0], M[2, 1], M[2, 2] = m00, m10, m20, m01, m11, m02
+    M[3, 0], M[3, 1], M[3, 2], M[3, 3] = m20, m30, m21, m40
+    M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4] = m11, m21, m12, m31, m22
+    M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = m02, m12, m03, m22, m13, m04
+    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
 
 
 @nb.njit(cache=True, nogil=True)
@@ -122,7 +237,8 @@ def _firm(M, stiff, L):
 
 @nb.njit(cache=True, nogil=True)
 def fit(
-    first, last, points, weights, ends, views, Q, o, reach, stiff, rays, c2, rounds, surface
+    first, last, points, weights, ends, views, Q, o, reach, stiff, rays, square, rounds, surface,
+    off,
 ):  # fmt: skip
     """Fit the surfaces of some patches; return what they cost, m^2.
 
@@ -138,99 +254,68 @@ def fit(
         reach: (k,), m: how far a point is walked at most.
         stiff: (k,), m^4: what a squared second-order coefficient costs.
         rays: whether points lie on rays from the origin of their sensor.
-        c2: squared scale of the robust loss, m^2; 0: none.
+        square: squared scale of the robust loss, m^2; 0: none.
         rounds: of reweighting.
         surface: (k, 6), where to start, and where it ends.
+        off: (n,) gets how far every point lies off its surface, in units of its noise.
     """
-    phi, q, b, at = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
-    M, L = np.zeros((6, 6)), np.zeros((6, 6))
+    s = _room(first, last, ends, views)
+    b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     total = 0.0
     for k in range(first, last):
-        for j in range(6):
-            q[j] = surface[k, j]
+        q = surface[k]
+        n = _place(k, points, weights, ends, views, Q, o, rays, s)
         for _ in range(rounds):
-            M[:] = 0.0
-            b[:] = 0.0
-            for m in range(views[k], views[k + 1]):
-                for i in range(ends[m], ends[m + 1]):
-                    e = _meet(points[i], Q[m], o[m], q, rays, reach[k], at)
-                    _terms(phi, at[1], at[2])
-                    w = _weight(weights[i] / at[5], e, c2)
-                    for j in range(6):
-                        e += phi[j] * q[j]
-                    for j in range(6):
-                        t = w * phi[j]
-                        b[j] += t * e
-                        for c in range(j + 1):
-                            M[j, c] += t * phi[c]
+            _meet(n, q, rays, reach[k], s)
+            _weigh(n, square, s)
+            _surface_sums(n, s, M, b)
+            # the step goes to the coefficients themselves, which stiffness holds to nothing
+            for i in range(6):
+                for j in range(i + 1):
+                    b[i] += M[i, j] * q[j]
+                    if i != j:
+                        b[j] += M[i, j] * q[i]
             _firm(M, stiff[k], L)
             _forward(L, b)
             _backward(L, b)
             for j in range(6):
                 q[j] = b[j]
-        for j in range(6):
-            surface[k, j] = q[j]
-            if j > 2:
-                total += stiff[k] * q[j] * q[j]
-        for m in range(views[k], views[k + 1]):
-            for i in range(ends[m], ends[m + 1]):
-                e = _meet(points[i], Q[m], o[m], q, rays, reach[k], at)
-                s = weights[i] / at[5] * e * e
-                total += s if c2 == 0.0 else c2 * s / (c2 + s)
+        for j in range(3, 6):
+            total += stiff[k] * q[j] * q[j]
+        _meet(n, q, rays, reach[k], s)
+        total += _charge(n, square, s, off[ends[views[k]] :])
     return total
 
 
-@nb.njit(cache=True, nogil=True)
-def residuals(first, last, points, weights, ends, views, Q, o, reach, rays, surface, out):
-    """Write to ``out`` (n,) how far every point lies off its surface, in units of its noise."""
-    at = np.zeros(6)
-    for k in range(first, last):
-        for m in range(views[k], views[k + 1]):
-            for i in range(ends[m], ends[m + 1]):
-                e = _meet(points[i], Q[m], o[m], surface[k], rays, reach[k], at)
-                out[i] = np.sqrt(weights[i] / at[5]) * e
-
-
 @nb.njit(cache=True, nogil=True, inline="always")
-def _jacobian(J, at, pivot):
-    """Derivative by a shift and a turn of the frame about its pivot, in patch axes."""
-    n1, n2 = at[3], at[4]
-    a0, a1, a2 = at[0] - pivot[0], at[1] - pivot[1], at[2] - pivot[2]
+def _by_pose(J, i, s, pivot):
+    """Derivative at a foot by a shift and a turn of the frame about its pivot, in patch axes."""
+    n1, n2 = s[SLOPE_U, i], s[SLOPE_V, i]
+    a0, a1, a2 = s[FOOT_0, i] - pivot[0], s[FOOT_U, i] - pivot[1], s[FOOT_V, i] - pivot[2]
     J[0], J[1], J[2] = 1.0, n1, n2
     J[3], J[4], J[5] = a1 * n2 - a2 * n1, a2 - a0 * n2, a0 * n1 - a1
 
 
-@nb.njit(cache=True, nogil=True)
-def _coupled(
-    first, last, points, weights, Q, o, pivot, reach, rays, q, c2, phi, J, at, B, g, H, M, b
-):  # fmt: skip
-    """Sum the blocks of one view, in patch axes: B (6, 6), g (6,), H (6, 6), terms by pose.
+@nb.njit(cache=True, nogil=True, inline="always")
+def _by_surface(phi, i, s):
+    u, v = s[FOOT_U, i], s[FOOT_V, i]
+    phi[0], phi[1], phi[2] = 1.0, u, v
+    phi[3], phi[4], phi[5] = u * u, u * v, v * v
 
-    And add what they say of the surface to M (6, 6), its lower triangle, and b (6,).
-    """
-    B[:] = 0.0
-    g[:] = 0.0
-    H[:] = 0.0
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _view_sums(first, last, pivot, s, z, Z):
+    """Sum ``w z_a z_c`` over a view's points, a of the pose: Z (6, COLUMNS)."""
+    Z[:] = 0.0
     for i in range(first, last):
-        e = _meet(points[i], Q, o, q, rays, reach, at)
-        _terms(phi, at[1], at[2])
-        w = _weight(weights[i] / at[5], e, c2)
-        _jacobian(J, at, pivot)
+        _by_pose(z[POSE:SURFACE], i, s, pivot)
+        _by_surface(z[SURFACE:ERROR], i, s)
+        z[ERROR] = s[OFF, i]
+        w = s[COUNTS, i]
         for a in range(6):
-            t = w * J[a]
-            g[a] += t * e
-            for c in range(a + 1):
-                B[a, c] += t * J[c]
-            for j in range(6):
-                H[j, a] += t * phi[j]
-        for j in range(6):
-            t = w * phi[j]
-            b[j] += t * e
-            for c in range(j + 1):
-                M[j, c] += t * phi[c]
-    for a in range(6):
-        for c in range(a):
-            B[c, a] = B[a, c]
+            t = w * z[a]
+            for c in range(COLUMNS):
+                Z[a, c] += t * z[c]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -248,131 +333,218 @@ def _turned(H, V, out):
 @nb.njit(cache=True, nogil=True)
 def gather(
     first, last, points, weights, ends, views, frame, Q, o, pivot, axes, reach, stiff, rays,
-    surface, c2, A, g,
+    surface, square, A, g,
 ):  # fmt: skip
     """Add what some patches say of the poses to A (N, 6, N, 6) and g (N, 6); surfaces eliminated.
 
     ``pivot`` (m, 3) is where the frame of each view is turned about, in the axes of its patch.
-    What is left of the surfaces' own gradient is followed to first order.
+    What is left of the surfaces' own gradient is followed to first order. Blocks of A above the
+    diagonal are left out.
     """
-    n = len(g)
-    phi, J, at, own, b = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
-    B, M, L = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
-    H, turned, row = np.zeros((n, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
-    column, once = np.zeros(6), np.zeros((6, 6))
+    s, count = _room(first, last, ends, views), len(g)
+    b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+    z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
+    H, turned, once, row = np.zeros((count, 6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
     for k in range(first, last):
         V = axes[k]
-        M[:] = 0.0
-        b[:] = 0.0
-        count = views[k + 1] - views[k]
-        for x in range(count):
-            m = views[k] + x
-            f = frame[m]
-            _coupled(
-                ends[m], ends[m + 1], points, weights, Q[m], o[m], pivot[m], reach[k], rays,
-                surface[k], c2, phi, J, at, B, own, H[x], M, b,
-            )  # fmt: skip
-            _turned(B, V, once)
-            _turned(once.T, V, turned)
-            _turned(own.reshape(1, 6), V, row)
-            for a in range(6):
-                g[f, a] += row[0, a]
-                for c in range(6):
-                    A[f, a, f, c] += turned[a, c]
+        n = _place(k, points, weights, ends, views, Q, o, rays, s)
+        _meet(n, surface[k], rays, reach[k], s)
+        _weigh(n, square, s)
+        _surface_sums(n, s, M, b)
         for j in range(3, 6):
             b[j] -= stiff[k] * surface[k, j]
         _firm(M, stiff[k], L)
         _forward(L, b)
+        begin = ends[views[k]]
+        count = views[k + 1] - views[k]
         for x in range(count):
-            _turned(H[x], V, turned)
+            m = views[k] + x
+            f = frame[m]
+            _view_sums(ends[m] - begin, ends[m + 1] - begin, pivot[m], s, z, Z)
+            _turned(Z[:, POSE:SURFACE], V, once)
+            _turned(once.T, V, turned)
             for a in range(6):
+                for c in range(6):
+                    A[f, a, f, c] += turned[a, c]
+            # rows of H: the pose in map axes; columns: the surface in units of its certainty
+            _turned(Z[:, SURFACE:ERROR].T, V, once)
+            _turned(Z[:, ERROR : ERROR + 1].T, V, row.reshape(1, 6))
+            for a in range(6):
+                h = H[x, a]
                 for j in range(6):
-                    column[j] = turned[j, a]
-                _forward(L, column)
-                s = 0.0
+                    h[j] = once[j, a]
+                _forward(L, h)
+                told = row[a]
                 for j in range(6):
-                    H[x, j, a] = column[j]
-                    s += column[j] * b[j]
-                g[frame[views[k] + x], a] -= s
+                    told -= h[j] * b[j]
+                g[f, a] += told
         for x in range(count):
-            for z in range(count):
-                f, h = frame[views[k] + x], frame[views[k] + z]
+            for y in range(x + 1):
+                f, h = frame[views[k] + x], frame[views[k] + y]
                 for a in range(6):
                     for c in range(6):
-                        s = 0.0
+                        t = 0.0
                         for j in range(6):
-                            s += H[x, j, a] * H[z, j, c]
-                        A[f, a, h, c] -= s
+                            t += H[x, a, j] * H[y, c, j]
+                        A[f, a, h, c] -= t
 
 
 @nb.njit(cache=True, nogil=True)
 def scores(
     first, last, points, weights, ends, views, frame, Q, o, pivot, axes, reach, stiff, rays,
-    surface, c2, groups, out,
+    surface, square, groups, out,
 ):  # fmt: skip
     """Add the reduced gradient of each group of points to ``out`` (kinds, groups, N, 6).
 
     ``groups`` (n, kinds) says which group a point is in.
     """
-    n = out.shape[2]
-    phi, J, at, own, b = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
-    B, M, L = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
-    H, turned, row = np.zeros((n, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
-    column = np.zeros(6)
+    s, count = _room(first, last, ends, views), out.shape[2]
+    phi, J, b, M, L = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+    z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
+    H, once, row = np.zeros((count, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
     for k in range(first, last):
-        V, q = axes[k], surface[k]
-        M[:] = 0.0
+        V = axes[k]
+        n = _place(k, points, weights, ends, views, Q, o, rays, s)
+        _meet(n, surface[k], rays, reach[k], s)
+        _weigh(n, square, s)
+        _surface_sums(n, s, M, b)
+        _firm(M, stiff[k], L)
+        begin = ends[views[k]]
         count = views[k + 1] - views[k]
         for x in range(count):
             m = views[k] + x
-            _coupled(
-                ends[m], ends[m + 1], points, weights, Q[m], o[m], pivot[m], reach[k], rays,
-                q, c2, phi, J, at, B, own, H[x], M, b,
-            )  # fmt: skip
-        _firm(M, stiff[k], L)
-        for x in range(count):
-            _turned(H[x], V, turned)
+            _view_sums(ends[m] - begin, ends[m + 1] - begin, pivot[m], s, z, Z)
+            _turned(Z[:, SURFACE:ERROR].T, V, once)
             for a in range(6):
                 for j in range(6):
-                    column[j] = turned[j, a]
-                _forward(L, column)
-                _backward(L, column)
-                for j in range(6):
-                    H[x, j, a] = column[j]
+                    H[x, a, j] = once[j, a]
+                _forward(L, H[x, a])
+                _backward(L, H[x, a])
         for m in range(views[k], views[k + 1]):
             for i in range(ends[m], ends[m + 1]):
-                e = _meet(points[i], Q[m], o[m], q, rays, reach[k], at)
-                _terms(phi, at[1], at[2])
-                wr = _weight(weights[i] / at[5], e, c2) * e
-                _jacobian(J, at, pivot[m])
+                _by_pose(J, i - begin, s, pivot[m])
+                _by_surface(phi, i - begin, s)
                 _turned(J.reshape(1, 6), V, row)
+                wr = s[COUNTS, i - begin] * s[OFF, i - begin]
                 for kind in range(groups.shape[1]):
-                    s = out[kind, groups[i, kind]]
+                    to = out[kind, groups[i, kind]]
                     for a in range(6):
-                        s[frame[m], a] += wr * row[0, a]
+                        to[frame[m], a] += wr * row[0, a]
                     for x in range(count):
                         f = frame[views[k] + x]
                         for a in range(6):
                             t = 0.0
                             for j in range(6):
-                                t += phi[j] * H[x, j, a]
-                            s[f, a] -= wr * t
+                                t += phi[j] * H[x, a, j]
+                            to[f, a] -= wr * t
 
 
 @nb.njit(cache=True, nogil=True)
-def moments(order, group, x, w, count, weight, mean, spread):
-    """Fill count, weight, mean and scatter of every group of points."""
-    for k in range(len(order)):
-        i, j = order[k], group[k]
-        count[j] += 1
-        weight[j] += w[i]
+def medians(ends, off, out):
+    """Write to ``out`` (k,) the median size of the values of each run; one run ends, one begins."""
+    most = 0
+    for k in range(len(out)):
+        most = max(most, ends[k + 1] - ends[k])
+    room = np.empty(most)
+    for k in range(len(out)):
+        n = ends[k + 1] - ends[k]
+        for i in range(n):
+            room[i] = abs(off[ends[k] + i])
+        part = room[:n]
+        part.sort()
+        out[k] = part[n // 2]
+
+
+@nb.njit(cache=True, nogil=True)
+def local(frame, views, axes, centre, T, Q, o):
+    """Fill Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
+    for k in range(len(views) - 1):
+        for m in range(views[k], views[k + 1]):
+            pose = T[frame[m]]
+            for a in range(3):
+                t = 0.0
+                for c in range(3):
+                    t += axes[k, c, a] * (pose[c, 3] - centre[k, c])
+                    q = 0.0
+                    for j in range(3):
+                        q += axes[k, j, a] * pose[j, c]
+                    Q[m, a, c] = q
+                o[m, a] = t
+
+
+@nb.njit(cache=True, nogil=True)
+def to_map(points, frame, T, out):
+    """Bring points (n, 3) of the given frames (n,) into the map frame."""
+    for i in range(len(points)):
+        pose = T[frame[i]]
         for a in range(3):
-            mean[j, a] += w[i] * x[i, a]
-    for j in range(len(count)):
+            out[i, a] = (
+                pose[a, 0] * points[i, 0]
+                + pose[a, 1] * points[i, 1]
+                + pose[a, 2] * points[i, 2]
+                + pose[a, 3]
+            )
+
+
+@nb.njit(cache=True, nogil=True)
+def extent(x, these, side, least, most):
+    """Fill ``least`` and ``most`` (3,) with the first and the last voxel of some points."""
+    for a in range(3):
+        least[a] = most[a] = np.int64(np.floor(x[these[0], a] / side))
+    for i in these:
         for a in range(3):
-            mean[j, a] /= weight[j]
-    for k in range(len(order)):
-        i, j = order[k], group[k]
+            c = np.int64(np.floor(x[i, a] / side))
+            least[a] = min(least[a], c)
+            most[a] = max(most[a], c)
+
+
+@nb.njit(cache=True, nogil=True)
+def number(x, these, side, least, spans, out):
+    """Write to ``out`` the number of each point's voxel in a box of ``spans`` (3,) voxels."""
+    for k in range(len(these)):
+        n = np.int64(0)
         for a in range(3):
-            for c in range(3):
-                spread[j, a, c] += w[i] * (x[i, a] - mean[j, a]) * (x[i, c] - mean[j, c])
+            c = np.int64(np.floor(x[these[k], a] / side))
+            n = n * spans[a] + c - least[a]
+        out[k] = n
+
+
+@nb.njit(cache=True, nogil=True)
+def sort_by(bins, count, order):
+    """Write to ``order`` (n,) the points sorted by bin; the sort is stable."""
+    at = np.zeros(count + 1, np.int64)
+    for k in bins:
+        at[k + 1] += 1
+    for k in range(count):
+        at[k + 1] += at[k]
+    for i in range(len(bins)):
+        order[at[bins[i]]] = i
+        at[bins[i]] += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def moments(order, begins, x, w, weight, mean, spread):
+    """Fill weight, mean and scatter of every run of points, each of which ends where one begins."""
+    for j in range(len(weight)):
+        total = m0 = m1 = m2 = 0.0
+        for i in order[begins[j] : begins[j + 1]]:
+            total += w[i]
+            m0 += w[i] * x[i, 0]
+            m1 += w[i] * x[i, 1]
+            m2 += w[i] * x[i, 2]
+        m0, m1, m2 = m0 / total, m1 / total, m2 / total
+        s00 = s10 = s11 = s20 = s21 = s22 = 0.0
+        for i in order[begins[j] : begins[j + 1]]:
+            d0, d1, d2 = x[i, 0] - m0, x[i, 1] - m1, x[i, 2] - m2
+            s00 += w[i] * d0 * d0
+            s10 += w[i] * d1 * d0
+            s11 += w[i] * d1 * d1
+            s20 += w[i] * d2 * d0
+            s21 += w[i] * d2 * d1
+            s22 += w[i] * d2 * d2
+        weight[j] = total
+        mean[j, 0], mean[j, 1], mean[j, 2] = m0, m1, m2
+        spread[j, 0, 0], spread[j, 1, 1], spread[j, 2, 2] = s00, s11, s22
+        spread[j, 0, 1] = spread[j, 1, 0] = s10
+        spread[j, 0, 2] = spread[j, 2, 0] = s20
+        spread[j, 1, 2] = spread[j, 2, 1] = s21

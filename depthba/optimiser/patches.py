@@ -38,6 +38,10 @@ LEAST = 0.3
 LEVEL = 0.9
 # How far a point is walked to its surface at most, in sides of its voxel.
 REACH = 0.5
+# Voxels of the box around all points, per point, above which they are sorted and not counted.
+SPARSE = 8.0
+# Points of which a median is taken: more say the same.
+ENOUGH = 200_000
 # Rounds of reweighting in a fit that starts near, and in one that starts from nothing.
 NEAR, AFRESH = 2, 4
 
@@ -91,37 +95,21 @@ class Patches:
     def fitted(self, T_map_camera: Array, workers: Workers, rounds: int = NEAR) -> Fit:
         """Return the surfaces that fit best at poses (N, 4, 4), and what they cost."""
         Q, o = self._local(T_map_camera)
-        surface = self.surface.copy()
+        surface, off = self.surface.copy(), np.empty(len(self.points))
 
         def of(share: tuple[int, int]) -> float:
             return float(
                 patch_kernels.fit(
                     *share, self.points, self.weights, self.ends, self.views, Q, o, self.reach,
-                    self.stiff, self.rays, self.scale**2, rounds, surface,
+                    self.stiff, self.rays, self.scale**2, rounds, surface, off,
                 )
             )  # fmt: skip
 
         cost = float(sum(workers.map(of, self._shares())))
-        return Fit(replace(self, surface=surface), cost)
+        return Fit(replace(self, surface=surface), cost, off)
 
-    def true(self, T_map_camera: Array, workers: Workers, most: float) -> Patches:
-        """Return the steep patches whose points lie on their surface but for noise.
-
-        Args:
-            T_map_camera: (N, 4, 4), where the surfaces were fitted.
-            workers: the threads.
-            most: median distance from the surface of the points of a patch, m.
-        """
-        level = np.abs(self.axes[:, 2, 0]) > LEVEL
-        off = self._off(T_map_camera, workers)
-        patch = np.repeat(np.arange(len(self)), np.diff(self.ends[self.views]))
-        order = np.lexsort((np.abs(off), patch))
-        ends = self.ends[self.views]
-        median = np.abs(off)[order][(ends[:-1] + ends[1:]) // 2]
-        return self._only((median <= most) & ~level)
-
-    def _only(self, these: NDArray[np.bool_]) -> Patches:
-        """Return some of the patches."""
+    def only(self, these: NDArray[np.bool_]) -> Patches:
+        """Return some of the patches, (k,)."""
         views = np.repeat(these, np.diff(self.views))
         points = np.repeat(views, np.diff(self.ends))
         return replace(
@@ -138,23 +126,6 @@ class Patches:
             stiff=self.stiff[these],
             surface=self.surface[these],
         )
-
-    def rescaled(self, T_map_camera: Array, workers: Workers, sigma: float) -> Fit:
-        """Return the patches with the loss that their residuals call for; it never widens.
-
-        Args:
-            T_map_camera: (N, 4, 4), where the surfaces were fitted.
-            workers: the threads.
-            sigma: standard deviation of the points' noise, m, which keeps the scale from vanishing.
-        """
-        if not len(self):
-            return Fit(self, 0.0)
-        squares = np.square(self._off(T_map_camera, workers))
-        scale = self.robust * max(1.4826 * float(np.sqrt(np.median(squares))), LEAST * sigma)
-        scale = min(scale, self.scale or scale)
-        cost = scale**2 * float((squares / (scale**2 + squares)).sum())
-        cost += float((self.stiff[:, None] * self.surface[:, 3:] ** 2).sum())
-        return Fit(replace(self, scale=scale), cost)
 
     def normal_equations(
         self, T_map_camera: Array, pivots: Array, workers: Workers
@@ -179,7 +150,8 @@ class Patches:
         for more, pull in workers.map(of, self._shares()):
             A += more
             g += pull
-        return A.reshape(6 * n, 6 * n), g
+        whole = A.reshape(6 * n, 6 * n)
+        return np.tril(whole) + np.tril(whole, -1).T, g
 
     def scores(
         self, T_map_camera: Array, pivots: Array, groups: list[NDArray[np.uint8]], count: int,
@@ -207,26 +179,11 @@ class Patches:
         total = sum(workers.map(of, self._shares()), start=np.zeros((kinds, count, n, 6)))
         return np.asarray(total.reshape(kinds, count, 6 * n))
 
-    def _off(self, T: Array, workers: Workers) -> Array:
-        """Return (n,) how far every point lies off its surface, m at a point of typical noise."""
-        off = np.empty(len(self.points))
-        Q, o = self._local(T)
-
-        def of(share: tuple[int, int]) -> None:
-            patch_kernels.residuals(
-                *share, self.points, self.weights, self.ends, self.views, Q, o, self.reach,
-                self.rays, self.surface, off,
-            )  # fmt: skip
-
-        workers.map(of, self._shares())
-        return off
-
     def _local(self, T: Array) -> tuple[Array, Array]:
         """Return Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
-        patch = np.repeat(np.arange(len(self)), np.diff(self.views))
-        V, R = self.axes[patch].transpose(0, 2, 1), T[self.frame, :3, :3]
-        away = T[self.frame, :3, 3] - self.centre[patch]
-        return np.ascontiguousarray(V @ R), np.ascontiguousarray((V @ away[..., None])[..., 0])
+        Q, o = np.empty((len(self.frame), 3, 3)), np.empty((len(self.frame), 3))
+        patch_kernels.local(self.frame, self.views, self.axes, self.centre, T, Q, o)
+        return Q, o
 
     def _in_patches(self, pivots: Array) -> Array:
         """Return (m, 3) the pivot of each view's frame in the axes of its patch."""
@@ -247,6 +204,33 @@ class Fit:
     patches: Patches
     cost: float
     """Robust sum of squared distances from the surfaces, m^2."""
+    off: Array
+    """(n,) how far every point lies off its surface, m at a point of typical noise."""
+
+    def true(self, most: float) -> Patches:
+        """Return the steep patches whose points lie on their surface but for noise.
+
+        ``most``: median distance from the surface of the points of a patch, m.
+        """
+        patches, median = self.patches, np.empty(len(self.patches))
+        patch_kernels.medians(patches.ends[patches.views], self.off, median)
+        level = np.abs(patches.axes[:, 2, 0]) > LEVEL
+        return patches.only((median <= most) & ~level)
+
+    def rescaled(self, sigma: float) -> Fit:
+        """Return the patches with the loss that their residuals call for; it never widens.
+
+        ``sigma``: standard deviation of the points' noise, m, which keeps the scale from vanishing.
+        """
+        if not len(self.patches):
+            return self
+        patches, squares = self.patches, np.square(self.off)
+        some = squares[:: -(-len(squares) // ENOUGH)]
+        scale = patches.robust * max(1.4826 * float(np.sqrt(np.median(some))), LEAST * sigma)
+        scale = min(scale, patches.scale or scale)
+        cost = scale**2 * float((squares / (scale**2 + squares)).sum())
+        cost += float((patches.stiff[:, None] * patches.surface[:, 3:] ** 2).sum())
+        return Fit(replace(patches, scale=scale), cost, self.off)
 
 
 @dataclass(frozen=True)
@@ -303,92 +287,120 @@ def lay(
         workers: the threads.
     """
     n = len(T_map_camera)
-    x = np.einsum("nij,nj->ni", T_map_camera[cloud.frame, :3, :3], cloud.points)
-    x += T_map_camera[cloud.frame, :3, 3]
-    left = np.arange(len(x))
-    patch: Ints = np.full(len(x), -1)
-    axes, centre, size, total = [], [], [], 0
+    x = np.empty_like(cloud.points)
+    patch_kernels.to_map(cloud.points, cloud.frame, T_map_camera, x)
+    left, parts = np.arange(len(x)), []
     for side in sides:
         look()
-        if not len(left):
-            break
-        of, V, c = _voxels(x[left], cloud.weights[left], cloud.frame[left], n, side)
-        on = of >= 0
-        patch[left[on]] = total + of[on]
-        left = left[~on]
-        total += len(c)
-        axes.append(V)
-        centre.append(c)
-        size.append(np.full(len(c), side))
-    each = np.concatenate(size) if size else np.empty(0)
-    found = np.flatnonzero(patch >= 0)
-    order = found[np.lexsort((cloud.frame[found], patch[found]))]
-    key = patch[order] * n + cloud.frame[order]
-    new = np.concatenate([[True], key[1:] != key[:-1]])
-    begins = np.flatnonzero(new[: len(key)])
-    seen = patch[order][begins] if len(order) else np.empty(0, np.int64)
+        parts.append(_voxels(x, cloud, left, side))
+        left = parts[-1].left
+    order = np.concatenate([p.points for p in parts])
+    each = np.repeat(sides, [len(p.centre) for p in parts])
     laid = Patches(
-        points=np.ascontiguousarray(cloud.points[order]),
+        points=cloud.points[order],
         weights=cloud.weights[order],
         source=cloud.source[order],
-        ends=np.concatenate([begins, [len(order)]]).astype(np.int64),
-        frame=cloud.frame[order][begins],
-        views=np.concatenate([[0], np.cumsum(np.bincount(seen, minlength=total))]).astype(np.int64),
-        axes=np.ascontiguousarray(np.concatenate(axes)) if axes else np.empty((0, 3, 3)),
-        centre=np.concatenate(centre) if centre else np.empty((0, 3)),
+        ends=_ends([p.sizes for p in parts]),
+        frame=np.concatenate([p.frame for p in parts]),
+        views=_ends([p.views for p in parts]),
+        axes=np.concatenate([p.axes for p in parts]),
+        centre=np.concatenate([p.centre for p in parts]),
         reach=REACH * each,
         stiff=(sigma * each) ** 2,
-        surface=np.zeros((total, patch_kernels.TERMS)),
+        surface=np.zeros((len(each), patch_kernels.TERMS)),
         robust=robust,
         scale=0.0,
         rays=cloud.rays,
         frames=n,
     )
-    fit = Fit(laid, 0.0)
+    fit = Fit(laid, 0.0, np.zeros(len(order)))
     for _ in range(AFRESH):
-        fit = fit.patches.fitted(T_map_camera, workers, 1)
-        fit = fit.patches.rescaled(T_map_camera, workers, sigma)
+        fit = fit.patches.fitted(T_map_camera, workers, 1).rescaled(sigma)
     return fit
 
 
-def _voxels(
-    x: Array, weights: Array, frame: Ints, frames: int, side: float
-) -> tuple[Ints, Array, Array]:
-    """Find patches in voxels of the given side, m.
+def _ends(sizes: list[Ints]) -> Ints:
+    """Return where runs of the given sizes end, and a 0 before them."""
+    return np.concatenate([[0], np.cumsum(np.concatenate(sizes))])
 
-    Returns:
-        (n,) the patch of each point, -1 for none; axes (k, 3, 3) and centres (k, 3).
-    """
-    cell = np.floor(x / side).astype(np.int64)
-    cell -= cell.min(axis=0)
-    spans = cell.max(axis=0) + 1
-    key = ((cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]) * frames + frame
-    order = np.argsort(key, kind="stable")
-    sorted_key = key[order]
+
+@dataclass(frozen=True)
+class _Found:
+    """Patches in voxels of one side."""
+
+    points: Ints
+    """(n,), indices of the points on patches, by patch and by frame."""
+    sizes: Ints
+    """(m,), points of each view."""
+    frame: Ints
+    """(m,), its frame."""
+    views: Ints
+    """(k,), views of each patch."""
+    axes: Array
+    """(k, 3, 3)."""
+    centre: Array
+    """(k, 3)."""
+    left: Ints
+    """Indices of the points on none, ascending."""
+
+
+def _voxels(x: Array, cloud: Cloud, these: Ints, side: float) -> _Found:
+    """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m."""
+    if not len(these):
+        none = np.empty(0, np.int64)
+        return _Found(none, none, none, none, np.empty((0, 3, 3)), np.empty((0, 3)), these)
+    voxel, k = _voxel_of(x, these, side)
+    order = np.empty_like(these)
+    patch_kernels.sort_by(voxel, k, order)
     look()
-    first = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
-    view = np.cumsum(first) - 1
-    where = sorted_key[first] // frames
-    voxel = np.cumsum(np.concatenate([[True], where[1:] != where[:-1]])) - 1
-    m, k = len(where), int(voxel[-1]) + 1
-    count, weight = np.zeros(m, np.int64), np.zeros(m)
-    mean, spread = np.zeros((m, 3)), np.zeros((m, 3, 3))
-    patch_kernels.moments(order, view, x, weights, count, weight, mean, spread)
-    many = count >= FEWEST
-    on = voxel[many]
+    voxel, order = voxel[order], these[order]
+    frame = cloud.frame[order]
+    new = (voxel[1:] != voxel[:-1]) | (frame[1:] != frame[:-1])
+    begins = np.flatnonzero(np.concatenate([[True], new]))
+    voxel, frame = voxel[begins], frame[begins]
+    begins = np.append(begins, len(order))
+    m = len(frame)
+    weight, mean, spread = np.empty(m), np.empty((m, 3)), np.empty((m, 3, 3))
+    patch_kernels.moments(order, begins, x, cloud.weights, weight, mean, spread)
     look()
-    pooled = np.zeros((k, 3, 3))
+    many = np.diff(begins) >= FEWEST
+    several = np.bincount(voxel[many], minlength=k) >= SEVERAL
+    many &= several[voxel]
+    # from here on of the voxels that several frames see
+    on, k = (np.cumsum(several) - 1)[voxel[many]], int(several.sum())
+    total, pooled = np.bincount(on, weight[many], k), np.zeros((k, 3, 3))
     np.add.at(pooled, on, spread[many])
-    total = np.bincount(on, weight[many], k)
     values, axes = np.linalg.eigh(pooled)
-    good = (
-        (np.bincount(on, minlength=k) >= SEVERAL)
-        & (values[:, 1] > FLAT**2 * values[:, 0])
-        & (values[:, 1] > total * (WIDE * side) ** 2)
-    )
+    good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     moment = [np.bincount(on, weight[many] * mean[many, a], k) for a in range(3)]
     centre = np.stack(moment, axis=1) / np.maximum(total, 1e-300)[:, None]
-    patch: Ints = np.full(len(x), -1)
-    patch[order] = np.where((good[voxel] & many)[view], (np.cumsum(good) - 1)[voxel][view], -1)
-    return patch, axes[good], centre[good]
+    chosen = np.zeros(m, bool)
+    chosen[np.flatnonzero(many)[good[on]]] = True
+    sizes = np.diff(begins)
+    taken = order[np.repeat(chosen, sizes)]
+    rest = np.zeros(len(x), bool)
+    rest[these] = True
+    rest[taken] = False
+    return _Found(
+        taken,
+        sizes[chosen],
+        frame[chosen],
+        np.bincount(on, minlength=k)[good],
+        axes[good],
+        centre[good],
+        np.flatnonzero(rest),
+    )
+
+
+def _voxel_of(x: Array, these: Ints, side: float) -> tuple[Ints, int]:
+    """Return the voxel of some points, numbered in order without gaps, and how many there are."""
+    least, most = np.empty(3, np.int64), np.empty(3, np.int64)
+    patch_kernels.extent(x, these, side, least, most)
+    key, spans = np.empty_like(these), most - least + 1
+    patch_kernels.number(x, these, side, least, spans, key)
+    if float(np.prod(spans.astype(float))) > SPARSE * len(key):
+        used, numbers = np.unique(key, return_inverse=True)
+        return numbers, len(used)
+    there = np.bincount(key) > 0
+    return (np.cumsum(there) - 1)[key], int(there.sum())

@@ -144,10 +144,5 @@ def patches_beside(
     sides = tuple(s * spacing for s in CLOSE.sides)
     cloud = Cloud.of(problem)
     cloud = cloud.weighed(np.where(rough, 1.0, shared))
-    laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).patches
-    if len(laid):
-        laid = laid.true(T_map_camera, workers, TRUE * sigma)
-    if not len(laid):
-        return None
-    fit = laid.fitted(T_map_camera, workers)
-    return fit.patches.rescaled(T_map_camera, workers, sigma)
+    laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).true(TRUE * sigma)
+    return laid.fitted(T_map_camera, workers).rescaled(sigma) if len(laid) else None
