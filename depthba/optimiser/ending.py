@@ -32,6 +32,9 @@ MODEST = 2.0
 # A larger one must leave residuals whose inflation is below this share of what it was. Wrong
 # intrinsics, and frames that can slide, mimic patterns that explain less.
 CLEARED = 0.15
+# Any must leave residuals whose inflation is below this share: relief that a coarse map cannot hold
+# mimics one that grows with every step, and the inflation with it.
+GROWN = 1.25
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,16 @@ class Known:
 
 @dataclass(frozen=True)
 class _Before:
-    """Where a pattern was taken off that has yet to prove itself."""
+    """Where the first pattern was taken off: there it goes back to if one proves false."""
 
     end: End
     inflation: float
     problem: Problem
     """All points, as they were measured."""
     size: float
-    """Root mean square of the pattern over the image, m."""
+    """Root mean square over the image of the pattern that has been taken off since, m."""
+    share: float
+    """Of the inflation, that it may leave at most."""
 
 
 @dataclass
@@ -104,11 +109,10 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
     trail = Trail()
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
-        if before is not None and there.inflation > CLEARED * before.inflation:
+        if before is not None and there.inflation > before.share * before.inflation:
             engine.problem, engine.bend, engine.plain = before.problem, None, True
-            engine.refused_pattern, end = before.size, before.end
+            engine.refused_pattern, end, before = before.size, before.end, None
             there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
-        before = None
         known, outcome, level = there.correlation, end.outcome, end.level
         finer = engine.finer(level.grid.spacing, known, outcome)
         less = known.inflation < LESS * end.believed
@@ -122,8 +126,9 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
         # where nothing but the measured poses' weight changes, patches lie as well as they can
         tied = None if bent or finer < level.grid.spacing else outcome.tied
         if bent and there.believed is not None:
-            before = _on_trial(engine, end, there)
-            level = engine.unbent(level, trail.next(engine.bend, there.believed.pattern))
+            taken = trail.next(engine.bend, there.believed.pattern)
+            before = _on_trial(engine, before, end, there, taken)
+            level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
         if finer < level.grid.spacing:
             index += 1
@@ -185,12 +190,13 @@ def _bent(engine: Engine, there: Known, sigma: float) -> bool:
     return bool(gain @ there.correlation.S @ gain > dof * BENT**2 * variance)
 
 
-def _on_trial(engine: Engine, end: End, there: Known) -> _Before | None:
-    """Return where to go back to if the pattern proves false; None: it need not prove itself."""
+def _on_trial(
+    engine: Engine, before: _Before | None, end: End, there: Known, taken: NDArray[np.float64]
+) -> _Before:
+    """Return where to go back to if the pattern (m,) that is taken off now proves false."""
     waves, noise = engine.problem.waves, engine.problem.noise
-    if engine.bend is not None or there.believed is None or waves is None:
-        return None
-    size = waves.size(there.believed.pattern)
-    if noise is not None and size <= MODEST * noise:
-        return None
-    return _Before(end, there.inflation, engine.problem, size)
+    assert waves is not None  # a pattern is made of them
+    size = waves.size(taken)
+    share = GROWN if noise is not None and size <= MODEST * noise else CLEARED
+    before = before or _Before(end, there.inflation, engine.problem, size, share)
+    return replace(before, size=size, share=share)

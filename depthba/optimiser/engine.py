@@ -230,7 +230,7 @@ class Engine:
             return poses
         inflation = self.doubt * (known.inflation if known else 1.0)
         poses = tied_by_patches(
-            self.problem, poses, spacing, self.prior, self.acting, inflation, self.free,
+            self.problem, poses, self._fine(spacing), self.prior, self.acting, inflation, self.free,
             self.workers,
         )  # fmt: skip
         self.clock.lap("patches")
@@ -246,10 +246,20 @@ class Engine:
         if not self.preset.robust:
             return replace(level, tied=None)
         tied = patches_beside(
-            self.problem, state.T_map_camera, level.grid.spacing, self.preset.robust,
-            robust_sigma(lin.residuals), self.workers, shared,
+            self.problem, state.T_map_camera, level.grid.spacing, self._fine(level.grid.spacing),
+            self.preset.robust, robust_sigma(lin.residuals), self.workers, shared,
         )  # fmt: skip
         return replace(level, tied=tied)
+
+    def _fine(self, spacing: float) -> float:
+        """Return the spacing that the voxels of patches go by, m, beside a map of a spacing.
+
+        A map may be asked for that is coarser than the points: a quadric over as much of a rough
+        scene ties what is not the same.
+        """
+        if self.options.resolution is None:
+            return spacing
+        return min(spacing, schedule.finest_spacing(self.problem))
 
     def with_patches(
         self, level: Level, state: State, lin: Linearisation, at: reduced.Reduction

@@ -64,7 +64,7 @@ def tied_by_patches(
     Args:
         problem: the points.
         poses: (N, 4, 4) where to start.
-        spacing: of the finest map, m.
+        spacing: that the voxels go by, m: of the finest map, or of a finer one.
         prior: the measured poses, whose information holds what no patch does.
         acting: the measured poses as they enter the cost.
         inflation: factor on the variance of what the points say, for their correlation.
@@ -124,8 +124,8 @@ def _settled(
 
 
 def patches_beside(
-    problem: Problem, T_map_camera: Array, spacing: float, robust: float, sigma: float,
-    workers: Workers, shared: float = SHARED,
+    problem: Problem, T_map_camera: Array, spacing: float, fine: float, robust: float,
+    sigma: float, workers: Workers, shared: float = SHARED,
 ) -> Fit | None:  # fmt: skip
     """Return patches over what is steep, fitted at the poses (N, 4, 4); None: nothing.
 
@@ -135,13 +135,14 @@ def patches_beside(
         problem: the points.
         T_map_camera: (N, 4, 4).
         spacing: of the map, m.
+        fine: the spacing that the voxels go by, m.
         robust: scale of the loss, in robust standard deviations of the residuals.
         sigma: standard deviation of the points' noise, m.
         workers: the threads.
         shared: weight of the points that the map takes at their full weight, too.
     """
     rough = np.concatenate(rough_points(problem, T_map_camera, spacing))
-    sides = tuple(s * spacing for s in CLOSE.sides)
+    sides = tuple(s * fine for s in CLOSE.sides)
     cloud = Cloud.of(problem)
     cloud = cloud.weighed(np.where(rough, 1.0, shared))
     laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).true(TRUE * sigma)
