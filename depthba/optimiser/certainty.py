@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from depthba.optimiser import coupling, pattern, probes, reduced
+from depthba.optimiser import coupling, dense, pattern, probes, reduced
 from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
@@ -17,7 +17,7 @@ from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
 from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import PosePrior, about_pivot
 from depthba.optimiser.problem import BLOCKS, Problem
-from depthba.optimiser.slope_noise import MANY, firm, largest_share
+from depthba.optimiser.slope_noise import firm, largest_share
 from depthba.optimiser.workers import Workers
 from depthba.result import WeakDirection
 
@@ -120,22 +120,13 @@ def correlation(
 def _solved(
     whole: NDArray[np.float64], scores: Sequence[NDArray[np.float64]]
 ) -> list[NDArray[np.float64]]:
-    """Return ``whole^-1 s`` for each kind of scores s, (blocks, d).
-
-    Few unknowns are answered by the inverse, digit for digit what they always were.
-    """
-    d = len(whole)
-    if d <= MANY:
-        V = np.linalg.inv(whole)
-        return [s @ V for s in scores]
-    found = np.linalg.solve(whole, np.concatenate(scores).T).T
-    return np.split(np.asarray(found), len(scores))
+    """Return ``whole^-1 s`` for each kind of scores s, (blocks, d)."""
+    found = dense.solved(whole, np.concatenate(scores).T).T
+    return np.split(found, len(scores))
 
 
 def _form(x: NDArray[np.float64], M: NDArray[np.float64]) -> float:
     """Return the sum of ``x_b^T M x_b`` over blocks b; x (blocks, d)."""
-    if len(M) <= MANY:
-        return float(np.einsum("bi,ij,bj->", x, M, x))
     return float(np.vdot(x @ M, x))
 
 
@@ -152,7 +143,7 @@ def _neighbours_mixed(scores: NDArray[np.float64]) -> NDArray[np.float64]:
 def beyond_scalar(
     scores: NDArray[np.float64], S: NDArray[np.float64], variance: float
 ) -> NDArray[np.float64]:
-    """Return the scatter of the gradient that blocks show beyond ``variance * S``.
+    """Return F (d, k): blocks' gradients scatter by ``F F^T`` beyond ``variance * S``.
 
     One factor on the variance is too little for the directions in which the blocks' gradients add
     up, such as a pattern that tilts all frames alike. Of as many blocks of independent points the
@@ -167,12 +158,11 @@ def beyond_scalar(
     blocks, d = scores.shape
     expected = variance * S
     expected = expected + np.diag(1e-6 * np.diag(expected) + 1e-300)
-    root = np.linalg.cholesky(firm(expected))
-    white = np.linalg.solve(root, scores.T)
-    values, vectors = eigh(white @ white.T)
-    above = values > (1 + np.sqrt(d / blocks)) ** 2
-    out = root @ vectors[:, above]
-    return np.asarray((out * (values[above] - 1)) @ out.T)
+    root = dense.cholesky(firm(expected))
+    white = dense.forward(root, scores.T)
+    vectors, sizes, _ = np.linalg.svd(white, full_matrices=False)
+    above = sizes > 1 + np.sqrt(d / blocks)
+    return np.asarray(root @ (vectors[:, above] * np.sqrt(sizes[above] ** 2 - 1)))
 
 
 def block_scores(
@@ -259,18 +249,19 @@ def assess(
     J = about_pivot(state.T_map_camera, lin.pivots)
     data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
     held = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
-    posterior = np.asarray(np.linalg.inv(data + held), float)
-    careful = np.asarray(np.linalg.inv(data / doubt + held), float)
+    posterior = dense.inverse(data + held)
+    careful = posterior if doubt == 1.0 else dense.inverse(data / doubt + held)
     if known is not None and keep.any():
         whole = known.S[np.ix_(keep, keep)]
-        scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30) ** 2
-        beyond = posterior @ scatter @ posterior
+        scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30)
+        moved = posterior @ scatter
+        beyond = moved @ moved.T
         posterior, careful = posterior + beyond, careful + beyond
     weak = _weak_directions(careful, held, free, frame_ids, problem)
     about_pivots = np.zeros((6 * n, 6 * n))
     # without belief in the prior a trace of it stays, so that open directions are large and not
     # infinite
-    about_pivots[np.ix_(keep, keep)] = posterior if believed else np.linalg.inv(data + 1e-6 * held)
+    about_pivots[np.ix_(keep, keep)] = posterior if believed else dense.inverse(data + 1e-6 * held)
     for i in np.flatnonzero(~free):
         if prior.information[i].any():
             inverse = np.linalg.inv(J[i])
@@ -303,7 +294,7 @@ def _weak_directions(
     alike.
     """
     weak = []
-    measured = np.linalg.inv(held)
+    measured = dense.inverse(held)
     for k, i in enumerate(np.flatnonzero(free)):
         window = slice(6 * k, 6 * k + 6)
         believed = measured[window, window]

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from depthba.optimiser import dense
 from depthba.optimiser.coupling import gather, spread, spread_over
 from depthba.optimiser.linearise import Linearisation
 from depthba.optimiser.reduced import Reduction, lumped
@@ -44,6 +45,30 @@ class Step:
     squared, times the residual variance."""
 
 
+@dataclass(frozen=True)
+class Held:
+    """What the points say where part of it is noise in the map's slope.
+
+    A gradient g that is ``-S0 x`` but for noise of covariance S says ``S0 S^-1 S0`` about x,
+    through ``S0 S^-1 g``: where noise is all there is, the measured poses stand.
+    """
+
+    through: NDArray[np.float64]
+    """(d, d), ``S0 S^-1`` over the free frames."""
+    bound: NDArray[np.float64]
+    """(d, d), ``S0 S^-1 S0``."""
+
+    @staticmethod
+    def of(S: NDArray[np.float64], sure: NDArray[np.float64], free: NDArray[np.bool_]) -> Held:
+        """Return it for S (6N, 6N) and what of it is no noise, S0 (6N, 6N); free (N,) frames."""
+        window = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
+        own = np.diag(S[window])
+        ridge = 1e-9 * np.diag(own + np.max(own, initial=1e-300) * 1e-3)
+        through = dense.solved(S[window] + ridge, sure[window]).T
+        bound = through @ sure[window]
+        return Held(through, (bound + bound.T) / 2)
+
+
 def solve(
     lin: Linearisation,
     free: NDArray[np.bool_],
@@ -54,7 +79,7 @@ def solve(
     outer: int,
     near: NDArray[np.float64] | None = None,
     here: Reduction | None = None,
-    sure: NDArray[np.float64] | None = None,
+    held: Held | None = None,
 ) -> Step:
     """Solve the damped normal equations.
 
@@ -71,9 +96,7 @@ def solve(
         near: (6N, 6N) reduced matrix from earlier in the level: the preconditioner, in place of the
             lumped one.
         here: the reduction of ``lin`` itself: the direct road.
-        sure: (6N, 6N) what of ``near`` is not noise in the map's slope, S0. A gradient g that is
-            ``-S0 x`` but for noise of covariance S says ``S0 S^-1 S0`` about x, through
-            ``S0 S^-1 g``: where noise is all there is, the measured poses stand.
+        held: what of an earlier reduced matrix is not noise in the map's slope, in place of all.
     """
     n = len(lin.B)
     inner = min(0.1 * tolerance, ALIKE)
@@ -81,8 +104,8 @@ def solve(
     answer, _ = solver.solve(-lin.g_map, inner)
     g = lin.g_pose + gather(lin, answer, workers)
     keep = np.repeat(free, 6)
-    if sure is not None and near is not None:
-        steps, length = _held_step(g.ravel()[keep], prior, near, sure, keep, damping)
+    if held is not None:
+        steps, length = _held_step(g.ravel()[keep], prior, held, keep, damping)
         back, _ = solver.solve(spread(lin, steps, workers), inner)
         return Step(steps, answer - back, length)
     g = g + prior[1]
@@ -93,7 +116,7 @@ def solve(
     floor = 1e-12 * np.max(np.diag(bound), initial=1e-300)
     damp = damping * np.diag(bound) + floor
     factor = _factor(bound + np.diag(damp), floor)
-    held = extra[np.ix_(keep, keep)]
+    beside = extra[np.ix_(keep, keep)]
     steps, back = np.zeros((n, 6)), np.zeros_like(lin.g_map)
 
     def whole(v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,7 +134,7 @@ def solve(
         pose = whole(v)
         through, _ = solver.solve(spread(lin, pose, workers), inner)
         out = np.einsum("nij,nj->ni", lin.A, pose) - gather(lin, through, workers)
-        return np.asarray(out.ravel()[keep] + held @ v), through
+        return np.asarray(out.ravel()[keep] + beside @ v), through
 
     x, Sx = _preconditioned(product, factor, damp, -g.ravel()[keep], tolerance, outer, back)
     if outer == 0:
@@ -119,18 +142,13 @@ def solve(
     return Step(whole(x), answer - back, float(x @ Sx))
 
 
-def _held_step(g, prior, S, sure, keep, damping):
+def _held_step(g, prior, held, keep, damping):
     """Return the step (N, 6) that noise in the map's slope does not drive, and its length."""
     n = len(keep) // 6
-    extra = prior[0]
-    window = np.ix_(keep, keep)
-    ridge = 1e-9 * np.diag(np.diag(S[window]) + np.max(np.diag(S[window]), initial=1e-300) * 1e-3)
-    through = np.linalg.solve(S[window] + ridge, sure[window]).T
-    bound = through @ sure[window]
-    bound = (bound + bound.T) / 2 + extra[window]
+    bound = held.bound + prior[0][np.ix_(keep, keep)]
     floor = 1e-12 * np.max(np.diag(bound), initial=1e-300)
     factor = _factor(bound + np.diag(damping * np.diag(bound) + floor), floor)
-    x = -cho_solve(factor, through @ g + prior[1].ravel()[keep])
+    x = -cho_solve(factor, held.through @ g + prior[1].ravel()[keep])
     steps = np.zeros(6 * n)
     steps[keep] = x
     return steps.reshape(n, 6), float(x @ bound @ x)
@@ -140,7 +158,8 @@ def _factor(matrix, floor):
     """Cholesky factor of a matrix that rounding may have left a little short of definite."""
     for lift in (0.0, 1e-9, 1e-6, 1e-3):
         try:
-            return cho_factor(matrix + np.diag(lift * np.diag(matrix) + (lift > 0) * floor))
+            lifted = matrix + np.diag(lift * np.diag(matrix) + (lift > 0) * floor)
+            return dense.cholesky(lifted), True
         except np.linalg.LinAlgError:
             continue
     return cho_factor(np.diag(np.abs(matrix).sum(axis=1) + floor))

@@ -341,10 +341,11 @@ def gather(
     What is left of the surfaces' own gradient is followed to first order. Blocks of A above the
     diagonal are left out.
     """
-    s, count = _room(first, last, ends, views), len(g)
+    s, frames = _room(first, last, ends, views), len(g)
     b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
-    H, turned, once, row = np.zeros((count, 6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    H, row = np.zeros((frames, 6, 6)), np.zeros((1, 6))
+    turned, once = np.zeros((6, 6)), np.zeros((6, 6))
     for k in range(first, last):
         V = axes[k]
         n = _place(k, points, weights, ends, views, Q, o, rays, s)
@@ -368,13 +369,13 @@ def gather(
                     A[f, a, f, c] += turned[a, c]
             # rows of H: the pose in map axes; columns: the surface in units of its certainty
             _turned(Z[:, SURFACE:ERROR].T, V, once)
-            _turned(Z[:, ERROR : ERROR + 1].T, V, row.reshape(1, 6))
+            _turned(Z[:, ERROR : ERROR + 1].T, V, row)
             for a in range(6):
                 h = H[x, a]
                 for j in range(6):
                     h[j] = once[j, a]
                 _forward(L, h)
-                told = row[a]
+                told = row[0, a]
                 for j in range(6):
                     told -= h[j] * b[j]
                 g[f, a] += told
@@ -398,10 +399,10 @@ def scores(
 
     ``groups`` (n, kinds) says which group a point is in.
     """
-    s, count = _room(first, last, ends, views), out.shape[2]
+    s, frames = _room(first, last, ends, views), out.shape[2]
     phi, J, b, M, L = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
-    H, once, row = np.zeros((count, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
+    H, once, row = np.zeros((frames, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
     for k in range(first, last):
         V = axes[k]
         n = _place(k, points, weights, ends, views, Q, o, rays, s)

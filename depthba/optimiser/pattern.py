@@ -17,6 +17,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.optimiser import dense
 from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Feet, Ground
 from depthba.optimiser.grid import Grid
@@ -249,7 +250,7 @@ def believe(
     cross = found.cross[keep]
     S = held[np.ix_(keep, keep)]
     S = S + np.diag(1e-9 * np.diag(S) + 1e-300)
-    follow = np.linalg.solve(S, cross)
+    follow = dense.solved(S, cross)
     H = (found.own - cross.T @ follow) / variance
     values, vectors = np.linalg.eigh((H + H.T) / 2)
     known = values > KNOWN * values[-1]

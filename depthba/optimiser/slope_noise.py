@@ -12,11 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.linalg import eigh, solve_triangular
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
-from depthba.optimiser import map_kernels, probes, reduced
+from depthba.optimiser import dense, map_kernels, probes, reduced
 from depthba.optimiser.asking import look
+from depthba.optimiser.dense import MANY
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import (
@@ -34,8 +35,6 @@ SLIGHT = 0.02
 # What the data say counts as far as it exceeds this many times what noise alone would: what noise
 # truly put in scatters about what a draw of it would have.
 MARGIN = 2.0
-# Unknowns above which single eigenvalues are not got by finding all of them.
-MANY = 600
 # Tolerance of the solves: a draw of noise need not be eliminated exactly.
 ROUGHLY = 0.1
 
@@ -104,7 +103,7 @@ def largest_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> floa
         return float(eigh(part, whole, eigvals_only=True)[-1])
     if not part.any():
         return 0.0
-    root = cholesky(whole, lower=True)
+    root = dense.cholesky(whole)
 
     def times(v: NDArray[np.float64]) -> NDArray[np.float64]:
         look()
@@ -142,7 +141,7 @@ def _definite(scaled: NDArray[np.float64]) -> bool:
     """Tell whether a matrix lies clear of the floor of `firm`, without any of its eigenvalues."""
     largest = float(np.max(np.abs(scaled).sum(axis=1)))  # no eigenvalue is larger (Gershgorin)
     try:
-        np.linalg.cholesky(scaled - 2.0 * max(1e-9, 1e-12 * largest) * np.eye(len(scaled)))
+        dense.cholesky(scaled - 2.0 * max(1e-9, 1e-12 * largest) * np.eye(len(scaled)))
     except np.linalg.LinAlgError:
         return False
     return True
@@ -152,10 +151,9 @@ def _less(
     S: NDArray[np.float64], noise: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return ``S - noise`` with what would fall below nothing in units of ``S + held`` set to 0."""
-    whole = firm(S + held)
-    values, vectors = eigh(S - noise, whole)
-    back = whole @ vectors
-    return np.asarray((back * np.maximum(values, 0.0)) @ back.T)
+    values, vectors = dense.relative(S - noise, firm(S + held))
+    below = values < 0.0
+    return S - noise - (vectors[:, below] * values[below]) @ vectors[:, below].T
 
 
 def noise_linearisation(

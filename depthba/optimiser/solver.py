@@ -161,6 +161,7 @@ def solve_level(
     damping, converged = 0.0, False
     dof = 6 * max(int(free.sum()), 1)
     # a direction that goes back to its measured pose gives up what it had gained from noise
+    held = None if sure is None or near is None else eliminate.Held.of(near, sure, free)
     unlearnt = 0.0 if sure is None else dof * max(temperature, sigma**2)
     mixer, pace, previous = Mixer(), PACE, np.inf
     recent: list[float] = []
@@ -177,7 +178,7 @@ def solve_level(
         direct = sure is None and reduced.direct_is_shorter(lin)
         here = reduced.reduce(lin, workers, free=free) if direct else None
         step = eliminate.solve(
-            lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here, sure
+            lin, free, believed, damping, workers, rules.tolerance, rules.outer, near, here, held
         )
         length = float(np.sqrt(max(step.decrement, 0.0)))
         metric = here.S if here is not None else near

@@ -49,16 +49,24 @@ def test_descent(benchmark: BenchmarkFixture) -> None:
             for (before, i), (after, j) in pairwise(ticks)
             if i.level == j.level and i.phase == j.phase and j.spacing == pytest.approx(spacing)
         ]
-        return float(np.median(apart)) / unit
+        # between some two of them patches are laid anew, or points weighed
+        return float(np.quantile(apart, 0.25)) / unit
 
-    stages = {name: s / unit for name, s in result.seconds.items() if name.startswith("level")}
+    stages = {
+        name: s / unit
+        for name, s in result.seconds.items()
+        if name.startswith("level") or name == "patches"
+    }
     finest = ticks[-1][1].level
-    to_fine = sum(s for name, s in stages.items() if not name.startswith(f"level {finest}"))
+    to_fine = sum(
+        s for name, s in stages.items()
+        if name.startswith("level") and not name.startswith(f"level {finest}")
+    )  # fmt: skip
     found = {
         "an iteration at 5 cm": iteration(0.05),
         "an iteration at 1.25 cm": iteration(0.0125),
         "10, 5, 2.5 cm": to_fine,
-        "10 to 1.25 cm": sum(stages.values()),
+        "10 to 1.25 cm, patches included": sum(stages.values()),
     }
     benchmark.extra_info.update({name: round(value, 1) for name, value in found.items()})
     print(f"\nNumPy transforms {sum(map(len, points)) / 1e6:.2f} M points in {1e3 * unit:.1f} ms")

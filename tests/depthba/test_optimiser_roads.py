@@ -98,12 +98,11 @@ def test_step_without_noise_in_it_is_the_plain_one(lin: Linearisation) -> None:
     prior = np.eye(6 * n), np.full((n, 6), 0.1)
     here = reduced.reduce(lin, workers, 1e-8)
     plain = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, here=here)
-    sure = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=here.S)
+    all_of_it, nothing = (eliminate.Held.of(here.S, S0, free) for S0 in (here.S, 0 * here.S))
+    sure = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, held=all_of_it)
     np.testing.assert_allclose(sure.pose, plain.pose, atol=1e-5 * np.abs(plain.pose).max())
     # where all is noise, the measured poses alone decide
-    held = eliminate.solve(
-        lin, free, prior, 0.0, workers, 1e-9, 0, near=here.S, sure=np.zeros_like(here.S)
-    )
+    held = eliminate.solve(lin, free, prior, 0.0, workers, 1e-9, 0, held=nothing)
     np.testing.assert_allclose(held.pose[1:], -0.1, rtol=1e-6)
 
 
@@ -140,11 +139,11 @@ def test_only_what_adds_up_over_blocks_widens_the_covariance() -> None:
     root = np.tril(rng.standard_normal((d, d))) + 3 * np.eye(d)
     S = root @ root.T
     scores = rng.standard_normal((blocks, d)) @ root.T / np.sqrt(blocks)
-    assert not beyond_scalar(scores, S, 1.0).any()
+    assert not beyond_scalar(scores, S, 1.0).size
     u = root @ np.eye(d)[3]
     pattern = scores + 40 * rng.standard_normal((blocks, 1)) * u / np.sqrt(blocks)
-    found = beyond_scalar(pattern, S, 1.0)
-    white = np.linalg.solve(root, np.linalg.solve(root, found).T)
+    found = np.linalg.solve(root, beyond_scalar(pattern, S, 1.0))
+    white = found @ found.T
     values, vectors = np.linalg.eigh(white)
     assert 800 < values[-1] < 2600 and np.abs(values[:-1]).max() < 1e-6 * values[-1]
     assert abs(vectors[3, -1]) > 0.99
