@@ -255,6 +255,7 @@ def assess(
         whole = known.S[np.ix_(keep, keep)]
         scatter = beyond_scalar(known.scores[:, keep], whole, variance) / max(variance, 1e-30)
         moved = posterior @ scatter
+        look()
         beyond = moved @ moved.T
         posterior, careful = posterior + beyond, careful + beyond
     weak = _weak_directions(careful, held, free, frame_ids, problem)

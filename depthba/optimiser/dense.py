@@ -81,16 +81,22 @@ def inverse(M: Array) -> Array:
     return np.asarray(_timely(lambda: np.linalg.inv(M), len(M)))
 
 
+def product(A: Array, B: Array) -> Array:
+    """Return ``A B`` of matrices (d, d)."""
+    return np.asarray(_timely(lambda: A @ B, len(A)))
+
+
 def relative(part: Array, whole: Array) -> tuple[Array, Array]:
     """Return eigenvalues (d,) of a part in units of a definite whole, and vectors (d, d).
 
     Of the vectors v with values a, in columns, the part is ``V diag(a) V^T``, the whole ``V V^T``.
     """
     L = cholesky(whole)
-    half = forward(L, part)
-    white = forward(L, half.T)
-    values, vectors = _timely(lambda: np.linalg.eigh((white + white.T) / 2), len(L))
-    return values, np.asarray(L @ vectors)
+    white = forward(L, forward(L, part).T)
+    look()
+    white += white.T
+    values, vectors = _timely(lambda: np.linalg.eigh(white / 2), len(L))
+    return values, product(L, vectors)
 
 
 def _by_columns(solve: Callable[[Array], Array], B: Array) -> Array:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from depthba.optimiser import dense
+from depthba.optimiser.asking import look
 from depthba.optimiser.coupling import gather, spread, spread_over
 from depthba.optimiser.linearise import Linearisation
 from depthba.optimiser.reduced import Reduction, lumped
@@ -64,8 +65,12 @@ class Held:
         window = np.ix_(np.repeat(free, 6), np.repeat(free, 6))
         own = np.diag(S[window])
         ridge = 1e-9 * np.diag(own + np.max(own, initial=1e-300) * 1e-3)
-        through = dense.solved(S[window] + ridge, sure[window]).T
-        bound = through @ sure[window]
+        whole = S[window] + ridge
+        look()
+        known = sure[window]
+        through = np.ascontiguousarray(dense.solved(whole, known).T)
+        look()
+        bound = dense.product(through, known)
         return Held(through, (bound + bound.T) / 2)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from depthba import se3
+from depthba.optimiser.asking import look
 
 # Rounds in which the gauge is found: it is next to linear.
 ROUNDS = 3
@@ -59,9 +60,11 @@ class PosePrior:
         e, turn, K, _ = self._errors(T_map_camera)
         J = np.kron(np.eye(2), turn) @ about_pivot(T_map_camera, pivots)
         weighted = np.einsum("nji,njk->nik", J, self.information)
+        look()
         matrix = block_diag(*(weighted @ J))
         if self.gauge is not None and self.information.any():
             U = (weighted @ K).reshape(matrix.shape[0], -1)
+            look()
             matrix -= U @ self._inverse(K) @ U.T
         return matrix, np.einsum("nij,nj->ni", weighted, e)
 

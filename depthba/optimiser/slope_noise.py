@@ -79,6 +79,7 @@ def without_slope_noise(
     if not free.any():
         return S, 0.0
     whole = firm((S + held)[keep])
+    look()
     found = largest_share(bound[keep], whole)
     if found < share:
         return S, found
@@ -128,7 +129,9 @@ def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
     own = np.abs(np.diag(whole))
     own = np.maximum(own, 1e-12 * np.max(own, initial=1e-300))
     root = np.sqrt(own)  # of each: products of tiny ones would be nothing
-    scaled = whole / np.outer(root, root)
+    scaled = whole / root
+    look()
+    scaled /= root[:, None]
     if len(whole) > MANY and _definite(scaled):
         return whole
     values = np.linalg.eigvalsh(scaled)
@@ -139,9 +142,13 @@ def firm(whole: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _definite(scaled: NDArray[np.float64]) -> bool:
     """Tell whether a matrix lies clear of the floor of `firm`, without any of its eigenvalues."""
-    largest = float(np.max(np.abs(scaled).sum(axis=1)))  # no eigenvalue is larger (Gershgorin)
+    # no eigenvalue is larger (Gershgorin)
+    largest = max(float(np.abs(row).sum()) for row in scaled)
+    look()
+    lower = scaled.copy()
+    lower.flat[:: len(lower) + 1] -= 2.0 * max(1e-9, 1e-12 * largest)
     try:
-        dense.cholesky(scaled - 2.0 * max(1e-9, 1e-12 * largest) * np.eye(len(scaled)))
+        dense.cholesky(lower)
     except np.linalg.LinAlgError:
         return False
     return True
@@ -151,9 +158,12 @@ def _less(
     S: NDArray[np.float64], noise: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return ``S - noise`` with what would fall below nothing in units of ``S + held`` set to 0."""
-    values, vectors = dense.relative(S - noise, firm(S + held))
+    left = S - noise
+    look()
+    values, vectors = dense.relative(left, firm(S + held))
     below = values < 0.0
-    return S - noise - (vectors[:, below] * values[below]) @ vectors[:, below].T
+    left -= (vectors[:, below] * values[below]) @ vectors[:, below].T
+    return left
 
 
 def noise_linearisation(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import eliminate, reduced
+from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.mixing import Mixer
@@ -175,6 +176,7 @@ def solve_level(
         if tied is not None:
             told, pull = tied.patches.normal_equations(state.T_map_camera, lin.pivots, workers)
             believed = believed[0] + told, believed[1] + pull
+        look()
         direct = sure is None and reduced.direct_is_shorter(lin)
         here = reduced.reduce(lin, workers, free=free) if direct else None
         step = eliminate.solve(
