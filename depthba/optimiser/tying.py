@@ -42,8 +42,8 @@ FAR = Round((4.0,), 10.0, along_ray=False)
 NEAR = Round((2.5,), 10.0, along_ray=False)
 CLOSE = Round((3.3, 1.7), 3.5, along_ray=True)
 ROUNDS = (FAR, FAR, NEAR, NEAR, CLOSE)
-# Points beyond which every so many are left out: the finest map takes them all.
-MOST = 500_000
+# Points beyond which every so many are left out, alone and beside a map, which takes them all.
+MOST, MOST_BESIDE = 500_000, 12_000_000
 # Most steps in a round, and how many standard deviations one is long when they have settled.
 STEPS, SETTLED = 8, 0.1
 # Largest median distance of a patch's points from its surface beside a map, in deviations of the
@@ -141,9 +141,12 @@ def patches_beside(
         workers: the threads.
         shared: weight of the points that the map takes at their full weight, too.
     """
-    rough = np.concatenate(rough_points(problem, T_map_camera, spacing))
-    sides = tuple(s * fine for s in CLOSE.sides)
-    cloud = Cloud.of(problem)
+    stride = -(-sum(map(len, problem.frames)) // MOST_BESIDE)
+    some = problem.thinned(stride)
+    rough = np.concatenate(rough_points(some, T_map_camera, spacing))
+    sides = tuple(s * fine * float(np.sqrt(stride)) for s in CLOSE.sides)
+    cloud = Cloud.of(some)
+    cloud = replace(cloud, source=stride * cloud.source)
     cloud = cloud.weighed(np.where(rough, 1.0, shared))
     laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).true(TRUE * sigma)
     return laid.fitted(T_map_camera, workers).rescaled(sigma) if len(laid) else None

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from depthba import se3
+from depthba.optimiser import tying
 from depthba.optimiser.patches import Cloud, Patches, lay
 from depthba.optimiser.prior import move
+from depthba.optimiser.tying import FAR, patches_beside
 from depthba.optimiser.workers import Workers
+from tests.depthba.optimiser_problems import problem_of
 
 N = 4
 
@@ -137,8 +140,6 @@ def test_one_and_two_threads_say_the_same(laid, workers):
 
 
 def test_balls_on_nothing_bring_the_frames_together(workers):
-    from depthba.optimiser.tying import FAR
-
     rng = np.random.default_rng(11)
     T_true = poses(rng)
     cloud = balls(rng, T_true, 3e-4)
@@ -155,6 +156,27 @@ def test_balls_on_nothing_bring_the_frames_together(workers):
             fit = fit.patches.fitted(T, workers)
     assert began > 5e-3
     assert np.abs(T[:, :3] - T_true[:, :3]).max() < 2e-4
+
+
+def test_of_very_many_points_some_are_taken_and_known_by_their_place(workers, monkeypatch):
+    rng = np.random.default_rng(4)
+    T = poses(rng)
+    cloud = balls(rng, T, 1e-4, points=4000)
+    clouds = [
+        np.column_stack([cloud.points[cloud.frame == i], np.ones((4000, 2))]) for i in range(N)
+    ]
+    problem = problem_of(clouds, T, 0.004)
+    whole = patches_beside(problem, T, 0.02, 0.02, 3.5, 3e-4, workers, 1.0)
+    monkeypatch.setattr(tying, "MOST_BESIDE", 6000)
+    some = patches_beside(problem, T, 0.02, 0.02, 3.5, 3e-4, workers, 1.0)
+    assert whole is not None and some is not None
+    assert 500 < len(some.patches.points) < 6000 < len(whole.patches.points)
+    for fit in (whole, some):
+        frame = np.repeat(fit.patches.frame, np.diff(fit.patches.ends))
+        for i in range(N):
+            mine, source = fit.patches.points[frame == i], fit.patches.source[frame == i]
+            assert len(set(source)) == len(source)
+            np.testing.assert_array_equal(mine, problem.frames[i].points[source, :3])
 
 
 def test_a_voxel_that_one_frame_sees_is_no_patch(workers):
