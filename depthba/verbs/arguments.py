@@ -169,7 +169,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     if get_origin(info.type) not in (Union, UnionType):
         return None
     members = [member for member in get_args(info.type) if member is not NoneType]
-    if len(members) != 1 or len(get_args(info.type)) != 2 or get_origin(members[0]) is Literal:
+    if len(members) != 1 or len(get_args(info.type)) != 2:
         return None
     inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(members[0], info.markers))
     if isinstance(inner, UnsupportedTypeAnnotationError) or not isinstance(inner.nargs, int):
@@ -181,6 +181,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     return dataclasses.replace(
         inner,
         nargs=1 if inner.nargs == 1 else (inner.nargs, 1),
+        choices=None if inner.choices is None else (*inner.choices, "None"),
         instance_from_str=read,
         is_instance=lambda value: value is None or inner.is_instance(value),
         str_from_instance=lambda v: ["None"] if v is None else inner.str_from_instance(v),
