@@ -100,7 +100,10 @@ def bound(
     """
     T_true = dataset.T_world_camera_true if truth is None else truth
     if T_true is None:
-        raise DatasetError(f"{dataset.path}: no poses_true.txt, but the bound needs the true poses")
+        raise DatasetError(
+            f"{dataset.path}: no poses_true.txt, but the bound needs the true poses; `depthba "
+            "evaluate` takes a file of them with --truth"
+        )
     if dataset.sensor.noise is None:
         raise DatasetError(
             f"{dataset.path}: dataset.json states no sensor.noise, but the bound needs it"

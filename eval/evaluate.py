@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba import durable, se3, trajectory
+from depthba import durable, se3
 from depthba.clouds import inside, load_clouds, point_spacing, transform
+from depthba.convert import Reading, pose_files
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
-from depthba.errors import OptionError, RunError
+from depthba.errors import DatasetError, OptionError, RunError
 from depthba.options import options_of
 from depthba.picture import CELL_SPACINGS
 from depthba.selecting import selected
@@ -37,6 +38,8 @@ PATCH_CELLS = 1.5
 """Radius of the neighbourhoods in which the common cloud's sharpness is judged, in cells."""
 SAME_STAMP = 1e-6
 """Stamps that differ by no more than this, s, are one frame."""
+MAX_GAP = Reading().max_gap
+"""True poses of a file are interpolated over no longer a gap than this, s, as by `convert`."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class Evaluation:
     """Cells that two or more frames see, at the estimate."""
     pairs: int
     """Overlapping pairs of frames, at the estimate."""
+    true_frames: tuple[int, ...]
+    """Ids of the frames with truth, the first of which was put onto it; empty: there is none."""
     nees_dof: int | None
     """Degrees of freedom behind the consistency figure; None without truth or covariance."""
     bound: Bound | None
@@ -69,15 +74,18 @@ def evaluate(
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
     bound: bool = False,
+    max_gap: float = MAX_GAP,
 ) -> list[Metric]:
     """Judge a run and leave metrics.json and report.md in its folder.
 
     Args:
         run: the run folder.
         dataset: the dataset's folder; None: the one that the run remembers.
-        truth: a file of true poses, TUM; None: the dataset's own, if it has any.
+        truth: a file of true poses, TUM, interpolated at the frames' stamps; only frames that have
+            a pose then count. None: the dataset's own, if it has any.
         cell: edge of the cells in which frames are compared, m; None: four point spacings.
         bound: whether to compute the Cramér-Rao bound too, and the errors over it.
+        max_gap: poses of ``truth`` are interpolated over no longer a gap, s.
 
     Returns:
         The metrics of the estimate, then those of the start poses, named ``start_...``.
@@ -85,10 +93,10 @@ def evaluate(
     Raises:
         RunError: the run or its dataset is missing, or they do not belong together.
         DatasetError: the dataset or the truth is wrong, or says too little for a bound.
-        OptionError: ``cell`` makes no sense.
+        OptionError: ``cell`` or ``max_gap`` makes no sense.
 
     """
-    judged = save(run, dataset, truth, cell, bound)
+    judged = save(run, dataset, truth, cell, bound, max_gap)
     return [*judged.metrics, *start(judged.start_metrics)]
 
 
@@ -98,6 +106,7 @@ def save(
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
     bound: bool = False,
+    max_gap: float = MAX_GAP,
 ) -> Evaluation:
     """Judge a run and leave metrics.json and report.md in its folder; see `evaluate`.
 
@@ -105,7 +114,7 @@ def save(
     """
     from eval.report import report  # which needs this module's types
 
-    judged = judge(run, dataset, truth, cell, bound)
+    judged = judge(run, dataset, truth, cell, bound, max_gap)
     durable.write_json(judged.run.path / "metrics.json", as_json(judged))
     durable.write_text(judged.run.path / "report.md", report(judged))
     recording = judged.run.path / RECORDING
@@ -123,11 +132,14 @@ def judge(
     truth: str | os.PathLike[str] | None = None,
     cell: float | None = None,
     bound: bool = False,
+    max_gap: float = MAX_GAP,
 ) -> Evaluation:
     """Compute all figures of a run; see `evaluate`. Writes nothing."""
     began = time.perf_counter()
     if cell is not None and not (np.isfinite(cell) and cell > 0):
         raise OptionError(f"cell: {cell} m, expected a length above 0")
+    if not (np.isfinite(max_gap) and max_gap > 0):
+        raise OptionError(f"max_gap: {max_gap} s, expected a time above 0")
     opened = Run.open(run)
     data = open_dataset(opened, dataset)
     rows = match_stamps(data.stamps, opened.stamps, f"{opened.path / 'poses.txt'}", f"{data.path}")
@@ -135,28 +147,31 @@ def judge(
     T_measured = data.T_world_camera_measured[rows]
     if T_start is None:
         T_start = T_measured
-    T_true = _truth(data, rows, opened, truth)
+    known, T_true = _truth(data, rows, opened, truth, max_gap)
 
     metrics: list[Metric] = []
     before: list[Metric] = []
     dof = None
     if T_true is not None:
-        metrics += pose_metrics(T_est, T_true)
-        before += pose_metrics(T_start, T_true)
-        if opened.covariance is not None and len(T_est) > 1:
-            judged = consistency(T_est, T_true, opened.covariance)
+        metrics += pose_metrics(T_est[known], T_true)
+        before += pose_metrics(T_start[known], T_true)
+        if opened.covariance is not None and len(known) > 1:
+            of_known = (6 * known[:, None] + np.arange(6)).ravel()
+            covariance = opened.covariance[np.ix_(of_known, of_known)]
+            judged = consistency(T_est[known], T_true, covariance)
             metrics.append(Metric("nees_per_dof", "1", "one", judged.nees_per_dof))
             dof = judged.dof
     least = None
     if bound:
-        least = _bound(data, rows, T_true, opened)
+        least = _bound(data, rows, known, T_true, opened)
         metrics += over_bound(metrics, least.translation, least.rotation)
 
     clouds = load_clouds(data, colours=False)
     points = [_within_range(data, clouds[k].points) for k in rows]
     if cell is None:
         cell = CELL_SPACINGS * point_spacing(data, points)
-    reference = T_measured if T_true is None else T_true
+    # a file's world may be another than the one in which region and axes are meant
+    reference = T_measured if T_true is None or truth is not None else T_true
     agreements = [
         agreement(
             points,
@@ -175,14 +190,14 @@ def judge(
         figures += marker_metrics(markers, ids, T)
     surface = None if T_true is None else TrueSurface.of(data)
     if T_true is not None and surface is not None:
-        world = [transform(T, p) for T, p in zip(T_true, points, strict=True)]
+        world = [transform(T, points[k]) for k, T in zip(known, T_true, strict=True)]
         roi = opened.config.get("roi")
         for depth_map, T, figures in (
             (opened.depth_map_start, T_start, before),
             (opened.depth_map, T_est, metrics),
         ):
             if depth_map is not None:
-                T_true_world = T_true[0] @ se3.inverse(T[0])
+                T_true_world = T_true[0] @ se3.inverse(T[known[0]])
                 figures += _map_metrics(depth_map, T_true_world, surface, world, roi)
     return Evaluation(
         run=opened,
@@ -192,6 +207,7 @@ def judge(
         cell=cell,
         shared_cells=len(agreements[1].spread.shared),
         pairs=len(agreements[1].pairs),
+        true_frames=tuple(ids[k] for k in known),
         nees_dof=dof,
         bound=least,
         seconds=time.perf_counter() - began,
@@ -257,6 +273,7 @@ def as_json(judged: Evaluation) -> dict[str, Any]:
         "cell": judged.cell,
         "shared_cells": judged.shared_cells,
         "pairs": judged.pairs,
+        "frames_with_truth": list(judged.true_frames),
         "nees_dof": judged.nees_dof,
         "bound": None
         if judged.bound is None
@@ -303,12 +320,23 @@ def _within_range(data: Dataset, points: Floats) -> Floats:
     return points[(points[:, 2] > low) & (points[:, 2] < high)]
 
 
-def _bound(data: Dataset, rows: NDArray[np.int64], T_true: Floats | None, run: Run) -> Bound:
+def _bound(
+    data: Dataset,
+    rows: NDArray[np.int64],
+    known: NDArray[np.int64],
+    T_true: Floats | None,
+    run: Run,
+) -> Bound:
     """Return the bound at the run's own map spacing and region of interest."""
     if len(rows) != len(data):
         raise RunError(
             f"{run.path}: {len(rows)} of the {len(data)} frames in {data.path}; "
             "the bound is for all of them"
+        )
+    if T_true is not None and len(known) != len(rows):
+        raise RunError(
+            f"{run.path}: {len(known)} of {len(rows)} frames have truth; the bound is for all of "
+            "them"
         )
     roi = run.config.get("roi")
     truth = None
@@ -324,11 +352,29 @@ def _bound(data: Dataset, rows: NDArray[np.int64], T_true: Floats | None, run: R
 
 
 def _truth(
-    data: Dataset, rows: NDArray[np.int64], run: Run, path: str | os.PathLike[str] | None
-) -> Floats | None:
-    """Return the true poses of the run's frames, (N, 4, 4), or None."""
+    data: Dataset,
+    rows: NDArray[np.int64],
+    run: Run,
+    path: str | os.PathLike[str] | None,
+    max_gap: float,
+) -> tuple[NDArray[np.int64], Floats | None]:
+    """Return which of the run's frames have true poses, (M,), and those, (M, 4, 4), or None."""
     if path is None:
         true = data.T_world_camera_true
-        return None if true is None else true[rows]
-    stamps, T = trajectory.read_tum(Path(path))
-    return T[match_stamps(stamps, run.stamps, f"{run.path / 'poses.txt'}", str(path))]
+        return (np.arange(0), None) if true is None else (np.arange(len(rows)), true[rows])
+    poses = pose_files.read(Path(path))
+    if poses.stamps is None:
+        raise DatasetError(
+            f"{path}: poses without stamps, expected TUM: stamp tx ty tz qx qy qz qw"
+        )
+    found = [poses.at(float(stamp), max_gap) for stamp in run.stamps]
+    known = np.array([k for k, T in enumerate(found) if T is not None], dtype=np.int64)
+    if len(known) < min(2, len(found)):
+        raise RunError(
+            f"{path}: stamps {poses.stamps.min():.6f} to {poses.stamps.max():.6f} s, but the "
+            f"frames of {run.path} are of {run.stamps.min():.6f} to {run.stamps.max():.6f} s, and "
+            f"{len(known) or 'none'} of {len(found)} "
+            f"{'has' if len(known) else 'have'} poses within {max_gap:g} s on both sides: "
+            "expected truth for two frames or more"
+        )
+    return known, np.array([T for T in found if T is not None])

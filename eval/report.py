@@ -208,15 +208,23 @@ def gain(before: Metric | None, now: Metric) -> str:
     return f"{three_digits(factor)} ×" if factor < 1000 else f"{factor:.0f} ×"
 
 
+def against(judged: Evaluation) -> str:
+    """Return what the errors are measured against, for how many frames."""
+    known, count = judged.true_frames, len(judged.run.stamps)
+    if not known:
+        return "There is no truth: the figures say how well the frames agree."
+    text = f"Errors are against the truth, frame {known[0]} put onto it."
+    if len(known) < count:
+        text += f" {len(known)} of {count} frames have truth; the others count in no error."
+    return text
+
+
 def _explanation(judged: Evaluation) -> str:
     text = (
         f"Frames are compared in cells of {three_digits(1e3 * judged.cell)} mm; two or more frames "
         f"see {judged.shared_cells} of them, and {judged.pairs} pairs of frames overlap."
     )
-    if any(m.name == "translation_mae" for m in judged.metrics):
-        text = f"Errors are against the truth, frame 0 put onto it. {text}"
-    else:
-        text = f"There is no truth: the figures say how well the frames agree. {text}"
+    text = f"{against(judged)} {text}"
     if judged.nees_dof is not None:
         text += (
             f" NEES is over {judged.nees_dof} degrees of freedom: 1 is an honest covariance, "

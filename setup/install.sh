@@ -69,4 +69,4 @@ echo "setup: installing the packages into .venv (about 3 GB; minutes the first t
 packages
 echo "setup: compiling the kernels"
 .venv/bin/python -m depthba.optimiser.warm
-echo "setup: done"
+echo "setup: done; now '. .venv/bin/activate', then 'depthba demo' shows it at work"

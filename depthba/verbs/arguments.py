@@ -23,6 +23,9 @@ from depthba.errors import OptionError
 
 Arguments = TypeVar("Arguments")
 
+Known = Mapping[str, Sequence[str]]
+"""By option of a verb, the words that may follow it; under "" those that are arguments."""
+
 _STYLE = (
     tyro.conf.OmitArgPrefixes,  # Options stand flat beside the verb's own
     tyro.conf.FlagCreatePairsOff,  # --overwrite, without --no-overwrite beside it
@@ -61,14 +64,19 @@ def parse(kind: type[Arguments], words: Sequence[str], prog: str) -> Arguments:
     return kind(**values)
 
 
-def completion(kinds: Mapping[str, type[Any]], prog: str, shell: str) -> str:
+def completion(
+    kinds: Mapping[str, type[Any]], prog: str, shell: str, known: Mapping[str, Known]
+) -> str:
     """Return the script with which a shell completes a command of several verbs.
 
     Args:
         kinds: by verb, the dataclass of its arguments.
         prog: the command.
         shell: bash, zsh or fish.
+        known: by verb and option, words to offer that the types do not tell; under "" those for
+            arguments.
     """
+    told = {name: {**_positional(kind), **known.get(name, {})} for name, kind in kinds.items()}
     verbs = tuple(
         Annotated[_with_config(kind), tyro.conf.subcommand(name)] for name, kind in kinds.items()
     )
@@ -78,7 +86,39 @@ def completion(kinds: Mapping[str, type[Any]], prog: str, shell: str) -> str:
     # tyro ends the process once it has printed
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         tyro.cli(both, prog=prog, args=words, config=_STYLE, registry=_FORMS)
-    return out.getvalue()
+    return _mended(out.getvalue(), shell, told)
+
+
+def _positional(kind: type[Any]) -> Known:
+    """Return the words that a verb's arguments choose from, under ""; nothing: it takes none."""
+    hints = [
+        get_args(hint)[0]
+        for hint in known_keys(kind).values()
+        if tyro.conf.Positional in getattr(hint, "__metadata__", ())
+    ]
+    choices = [str(word) for h in hints if get_origin(h) is Literal for word in get_args(h)]
+    return {"": choices} if hints else {}
+
+
+def _mended(script: str, shell: str, known: Mapping[str, Known]) -> str:
+    """Let tyro's script offer files, and the words it does not know, where they are meant."""
+    from depthba.verbs import completing
+
+    part = f"KNOWN = {dict(known)!r}\n\n\n{inspect.getsource(completing.offered)}\n\n"
+    head = "def main() -> None:"
+    call = "get_completions(words, current_index, COMPLETION_SPEC)"
+    ours = "offered(words, current_index, COMPLETION_SPEC, KNOWN, get_completions)"
+    swaps = {head: part.replace('"', '\\"') + head if shell == "fish" else part + head, call: ours}
+    if shell == "bash":
+        # readline's own way with files puts a slash behind a folder and escapes blanks
+        swaps['COMPREPLY=($(compgen -f -- "$cur"))'] = "COMPREPLY=()"
+        swaps["complete -F "] = "complete -o default -F "
+    if shell == "fish":
+        # its words end before the one at the cursor
+        swaps["$words $current)"] = "$words (commandline -ct) $current)"
+    for old, new in swaps.items():
+        script = script.replace(old, new)
+    return script
 
 
 def _with_config(kind: type[Any]) -> Any:
@@ -129,7 +169,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     if get_origin(info.type) not in (Union, UnionType):
         return None
     members = [member for member in get_args(info.type) if member is not NoneType]
-    if len(members) != 1 or len(get_args(info.type)) != 2 or get_origin(members[0]) is Literal:
+    if len(members) != 1 or len(get_args(info.type)) != 2:
         return None
     inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(members[0], info.markers))
     if isinstance(inner, UnsupportedTypeAnnotationError) or not isinstance(inner.nargs, int):
@@ -141,6 +181,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     return dataclasses.replace(
         inner,
         nargs=1 if inner.nargs == 1 else (inner.nargs, 1),
+        choices=None if inner.choices is None else (*inner.choices, "None"),
         instance_from_str=read,
         is_instance=lambda value: value is None or inner.is_instance(value),
         str_from_instance=lambda v: ["None"] if v is None else inner.str_from_instance(v),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,8 @@ class Arguments:
     """Print the script that lets a shell complete verbs, options and their choices.
 
     Put it where the shell looks, once, and again after an upgrade, for example
-    `depthba completion bash > ~/.local/share/bash-completion/completions/depthba`.
+    `depthba completion bash > ~/.local/share/bash-completion/completions/depthba`; bash looks there
+    with its package bash-completion. Without: `source <(depthba completion bash)` in ~/.bashrc.
     """
 
     shell: Annotated[Shell, tyro.conf.Positional, tyro.conf.arg(metavar="bash|zsh|fish")]
@@ -39,9 +41,25 @@ def run(arguments: Arguments) -> int:
             kinds[name] = importlib.import_module(verb.module).Arguments
         except ModuleNotFoundError as error:
             note(f"note: {name} is left out, it needs {error.name}: depthba[{verb.extra}]")
-    script = completion(kinds, "depthba", arguments.shell)
+    script = completion(kinds, "depthba", arguments.shell, _known(kinds))
     if arguments.json:
         print_json({"shell": arguments.shell, "script": script})
     else:
         print(script, flush=True)
     return DONE
+
+
+def _known(verbs: Container[str]) -> dict[str, dict[str, list[str]]]:
+    """Return the names that options and arguments of free text take, by verb."""
+    from depthba.convert.exporting import OURS, RESULTS
+    from depthba.convert.registry import formats
+
+    readable = [one.name for one in formats() if one.read is not None]
+    written = [one.name for one in formats() if one.write is not None]
+    to = list(dict.fromkeys([OURS, *written, *(one.name for one in RESULTS)]))
+    known = {"register": {"--kind": readable}, "convert": {"--kind": readable, "--to": to}}
+    if "generate" in verbs:
+        from sim.scenes import SCENES
+
+        known["generate"] = {"": list(SCENES)}
+    return known

@@ -201,7 +201,10 @@ def _datasets(
     with tempfile.TemporaryDirectory(prefix=".convert-", dir=parent) as folder:
         for k, src in enumerate(sources):
             if _is_run(src):
-                raise DatasetError(f"{src}: a run, expected a dataset; or --to NAME")
+                raise DatasetError(
+                    f"{src}: a run, expected a dataset; or say what of it is wanted, by DST such "
+                    "as cloud.ply or by --to such as --to colmap; --list has all"
+                )
             if importing.is_dataset(src):
                 datasets.append(Dataset.open(src))
                 kinds.append("depthba")

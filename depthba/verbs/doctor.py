@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from depthba.errors import RunError
 from depthba.verbs import DONE, KNOWN_ERROR
 from depthba.verbs.output import print_json
+
+if TYPE_CHECKING:
+    from depthba.dataset.faults import Fault
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ def _machine(json: bool) -> int:
 def _dataset(path: Path, json: bool) -> int:
     from depthba.dataset import Dataset, verify
 
-    faults = verify(path)
+    faults = _no_dataset_but_a_run(path) or verify(path)
     if faults:
         if json:
             print_json({"ok": False, "faults": [asdict(fault) for fault in faults]})
@@ -81,9 +85,25 @@ def _dataset(path: Path, json: bool) -> int:
     for warning in dataset.warnings:
         print(f"warning: {warning}")
     size = "" if camera is None else f" of {camera.width} x {camera.height}"
+    model = f" from {sensor.model}" if sensor.model else ""
     truth = "with" if summary["truth"] else "without"
     print(
-        f"{path}: whole. {dataset.name}: {len(dataset)} {sensor.kind} frames{size} "
-        f"from {sensor.model}, {truth} true poses, {summary['markers']} markers"
+        f"{path}: whole. {dataset.name}: {len(dataset)} {sensor.kind} frames{size}{model}, "
+        f"{truth} true poses, {summary['markers']} markers"
     )
     return DONE
+
+
+def _no_dataset_but_a_run(path: Path) -> list[Fault]:
+    """Return the fault of a run's folder, with where its dataset is; of others none."""
+    from depthba.convert.exporting import is_run
+    from depthba.dataset.faults import Fault
+    from depthba.stored_run import Run
+
+    if not is_run(path) or (path / "dataset.json").exists():
+        return []
+    try:
+        where = f"; its own is {Run.open(path).dataset_path}"
+    except RunError as error:
+        where = f" ({error})"
+    return [Fault("", None, f"{path}: a run of depthba, expected a dataset{where}")]

@@ -11,8 +11,8 @@ import tyro
 
 from depthba.verbs import DONE, WRONG_USAGE
 from depthba.verbs.output import note, print_json
-from eval.evaluate import Evaluation, as_json, save
-from eval.report import NAMES, SURFACES, VERDICTS, gain, show
+from eval.evaluate import MAX_GAP, Evaluation, as_json, save
+from eval.report import NAMES, SURFACES, VERDICTS, against, gain, show
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,10 @@ class Arguments:
     dataset: Path | None = None
     """Folder of the dataset. None: the one that each run remembers."""
     truth: Path | None = None
-    """File of true poses, TUM. None: poses_true.txt of the dataset, if it has one."""
+    """File of true poses, TUM, such as of motion capture: interpolated at the stamps of the frames;
+    frames without a pose count in no error. None: poses_true.txt of the dataset, if it has one."""
+    max_gap: float = MAX_GAP
+    """Poses of --truth are interpolated over no longer a gap, s."""
     cell: float | None = None
     """Edge of the cells in which frames are compared, m. None: four point spacings."""
     bound: bool = False
@@ -44,7 +47,14 @@ def run(arguments: Arguments) -> int:
         return WRONG_USAGE
     judged = []
     for path in arguments.runs:
-        one = save(path, arguments.dataset, arguments.truth, arguments.cell, arguments.bound)
+        one = save(
+            path,
+            arguments.dataset,
+            arguments.truth,
+            arguments.cell,
+            arguments.bound,
+            arguments.max_gap,
+        )
         judged.append(one)
         if not arguments.json:
             _print(one)
@@ -75,5 +85,6 @@ def _print(judged: Evaluation) -> None:
             table.add_row(words, first, show(now[name]), gain(before.get(name), now[name]))
     if judged.bound is not None:
         table.caption = f"{SURFACES[judged.bound.surface]}\n{table.caption}"
+    table.caption = f"{against(judged)}\n{table.caption}"
     # a pipe has no width of its own, and a table must not be cut there
     Console(width=None if sys.stdout.isatty() else 120).print(table)

@@ -236,6 +236,53 @@ def test_doctor_lists_every_fault_of_a_dataset_and_describes_a_whole_one(
     assert "000003.png" in done.stdout
 
 
+def test_doctor_says_where_the_dataset_of_a_run_is(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert cli.main(["register", str(dataset), "--out", str(run)]) in (0, 3)
+    capsys.readouterr()
+    assert cli.main(["doctor", str(run)]) == 1
+    told = capsys.readouterr().out
+    assert f"{run}: a run of depthba, expected a dataset; its own is {dataset}\n" in told
+    (run / "poses.txt").unlink()
+    assert cli.main(["doctor", str(run), "--json"]) == 1
+    (fault,) = json.loads(capsys.readouterr().out)["faults"]
+    assert "a run of depthba, expected a dataset (" in fault["text"]
+
+
+def test_doctor_leaves_out_a_model_without_a_name(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nameless = tmp_path / "nameless"
+    subprocess.run(["cp", "-r", dataset, nameless], check=True)
+    header = json.loads((nameless / "dataset.json").read_text())
+    for model, words in (("", ", with true poses"), ("mine", " from mine, with true poses")):
+        header["sensor"]["model"] = model
+        (nameless / "dataset.json").write_text(json.dumps(header))
+        assert cli.main(["doctor", str(nameless)]) == 0
+        told = capsys.readouterr().out
+        size = f"{header['sensor']['width']} x {header['sensor']['height']}"
+        assert f"depth frames of {size}{words}" in told
+
+
+def test_options_that_may_be_left_out_do_not_offer_none(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for verb in ("register", "convert"):
+        with pytest.raises(SystemExit):
+            cli.main([verb, "--help"])
+        told = capsys.readouterr().out
+        assert "--axes {opencv,opengl}" in told and "{None" not in told
+    from depthba.verbs import convert
+    from depthba.verbs.arguments import parse
+
+    for words, axes in ((["--axes", "opengl"], "opengl"), (["--axes", "None"], None), ([], None)):
+        assert parse(convert.Arguments, words, "convert").reading.axes == axes
+    with pytest.raises(SystemExit):
+        parse(convert.Arguments, ["--axes", "odd"], "convert")
+
+
 def test_doctor_looks_at_the_machine() -> None:
     done = depthba("doctor", "--json")
     told = json.loads(done.stdout)

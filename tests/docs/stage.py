@@ -27,6 +27,7 @@ def small(folder: Path) -> Path:
         write_scene(folder / data, frames=5, seed=seed)
         status = main(["register", str(folder / data), "--out", str(folder / run)])
         assert status == 0, f"{data}: status {status}"
+    shutil.copy(folder / "my-dataset" / "poses_true.txt", folder / "true.txt")
     return folder
 
 
@@ -34,7 +35,7 @@ def laid_out(stage: Path, folder: Path, without: Sequence[str] = ()) -> None:
     """Copy what a reader has into a folder; a copied run is of the dataset beside it."""
     for item in stage.iterdir():
         if item.name not in without:
-            shutil.copytree(item, folder / item.name)
+            (shutil.copytree if item.is_dir() else shutil.copy)(item, folder / item.name)
     for run, data in RUNS.items():
         file = folder / run / "result.json"
         if file.exists():

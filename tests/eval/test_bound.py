@@ -96,7 +96,7 @@ def test_without_truth_or_stated_noise_there_is_none(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"sensor\.noise"):
         bound(silent, SPACING)
     (dataset.path / "poses_true.txt").unlink()
-    with pytest.raises(DatasetError, match=r"poses_true\.txt"):
+    with pytest.raises(DatasetError, match=r"poses_true\.txt.* --truth"):
         bound(Dataset.open(dataset.path), SPACING)
 
 

@@ -15,14 +15,17 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from depthba import trajectory
+from depthba import se3, trajectory
+from depthba.cli import main
 from depthba.dataset import Dataset
 from depthba.depth_map import DepthMap
 from depthba.errors import DatasetError, OptionError, RunError
 from depthba.options import Options
 from depthba.result import Result
 from depthba.run_folder import RunFolder
+from depthba.stored_run import Run
 from eval.evaluate import evaluate, judge
+from eval.metrics import consistency, pose_metrics
 from eval.verbs import evaluate as verb
 
 Floats = NDArray[np.float64]
@@ -163,6 +166,102 @@ def test_another_truth_and_another_dataset_win(
     assert by_name(run, dataset=dataset.path)["translation_mae"] > 0
 
 
+@pytest.fixture
+def wobbly(run: Path, dataset: Dataset) -> Floats:
+    """True poses (N, 4, 4) in another world; gives the run's first frame a covariance as well."""
+    assert dataset.T_world_camera_true is not None
+    with np.load(run / "covariance.npz") as arrays:
+        saved = dict(arrays)
+    n = len(dataset)
+    A = np.random.default_rng(5).normal(size=(6 * n, 6 * n)) * np.tile([1e-4] * 3 + [1e-5] * 3, n)
+    saved["full"] = A.T @ A / n
+    np.savez(run / "covariance.npz", **saved)
+    T_file_world = se3.retract(np.eye(4), np.array([1.0, -2.0, 0.5, 0.4, -0.3, 1.0]))
+    return np.asarray(T_file_world @ dataset.T_world_camera_true)
+
+
+def test_truth_at_other_stamps_is_interpolated(
+    run: Path, dataset: Dataset, wobbly: Floats, tmp_path: Path
+) -> None:
+    exact, dense = tmp_path / "exact.txt", tmp_path / "dense.txt"
+    trajectory.write_tum(exact, dataset.stamps, wobbly)
+    # each pose lies a quarter of the way between two stamps, to which it moves evenly
+    step = np.array([4e-3, -2e-3, 1e-3, 2e-2, 1e-2, -3e-2])
+    around = [
+        (stamp + share * 0.01, se3.retract(T, share * step))
+        for stamp, T in zip(dataset.stamps, wobbly, strict=True)
+        for share in (-1.25, -0.25, 0.75, 1.75)
+    ]
+    trajectory.write_tum(dense, [s for s, _ in around], [T for _, T in around])
+    expected, found = judge(run, truth=exact), judge(run, truth=dense)
+    assert len(found.true_frames) == len(dataset) and found.nees_dof == expected.nees_dof
+    for ours, theirs in zip(found.metrics, expected.metrics, strict=True):
+        if not ours.name.startswith("marker"):
+            assert_allclose(ours.value, theirs.value, rtol=1e-6, atol=1e-9, err_msg=ours.name)
+
+
+def test_only_frames_that_have_truth_count(
+    run: Path, dataset: Dataset, wobbly: Floats, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some, n = np.array([1, 2, 4]), len(dataset)
+    file = tmp_path / "some.txt"
+    trajectory.write_tum(file, dataset.stamps[some], wobbly[some])
+    whole = judge(run)
+    assert verb.run(verb.Arguments(runs=(run,), truth=file)) == 0
+    for text in (capsys.readouterr().out, (run / "report.md").read_text()):
+        told = " ".join(text.split())
+        assert "frame 1 put onto it" in told and f"3 of {n} frames have truth" in told
+    saved = json.loads((run / "metrics.json").read_text())
+    assert saved["frames_with_truth"] == [1, 2, 4] and saved["nees_dof"] == 12
+
+    opened = Run.open(run)
+    assert opened.covariance is not None
+    T = opened.T_world_camera
+    expected = {m.name: m.value for m in pose_metrics(T[some], wobbly[some])}
+    moved = wobbly[1] @ se3.inverse(T[1]) @ T  # by hand: onto the first frame with truth
+    errors = (moved[[2, 4], :3, 3] - wobbly[[2, 4], :3, 3]).ravel()
+    assert saved["metrics"]["translation_rmse"]["value"] == pytest.approx(
+        np.sqrt(np.mean(errors**2))
+    )
+    for name, value in expected.items():
+        assert saved["metrics"][name]["value"] == pytest.approx(value), name
+    rows = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in some])
+    honest = consistency(T[some], wobbly[some], opened.covariance[np.ix_(rows, rows)])
+    assert saved["metrics"]["nees_per_dof"]["value"] == pytest.approx(honest.nees_per_dof)
+    # what needs no truth is told of all frames
+    assert saved["pairs"] == whole.pairs
+    with pytest.raises(RunError, match=f"3 of {n} frames have truth; the bound is for all"):
+        evaluate(run, truth=file, bound=True)
+
+
+def test_truth_of_other_times_is_refused_in_one_line(
+    run: Path, dataset: Dataset, wobbly: Floats, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n, first, last = len(dataset), dataset.stamps[0], dataset.stamps[-1]
+    file = tmp_path / "later.txt"
+    trajectory.write_tum(file, dataset.stamps + 1000.005, wobbly)
+    assert main(["evaluate", str(run), "--truth", str(file)]) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 1
+    for words in (
+        f"{first + 1000.005:.6f} to {last + 1000.005:.6f} s",
+        f"{first:.6f} to {last:.6f} s",
+        f"none of {n} have",
+    ):
+        assert words in told[0]
+    between = tmp_path / "between.txt"
+    trajectory.write_tum(between, dataset.stamps + 0.3, wobbly)  # around, but far apart
+    with pytest.raises(RunError, match=r"within 0\.1 s on both sides"):
+        evaluate(run, truth=between)
+    assert len(judge(run, truth=between, max_gap=2.0).true_frames) == n - 1
+    trajectory.write_tum(file, dataset.stamps[2:3], wobbly[2:3])
+    with pytest.raises(RunError, match=f"1 of {n} has"):
+        evaluate(run, truth=file)
+    file.write_text("".join("1 0 0 0 0 1 0 0 0 0 1 0\n" for _ in range(n)))
+    with pytest.raises(DatasetError, match="without stamps"):
+        evaluate(run, truth=file)
+
+
 def test_without_truth_only_agreement_is_judged(
     run: Path, dataset: Dataset, tmp_path: Path
 ) -> None:
@@ -179,11 +278,8 @@ def test_what_does_not_fit_is_refused(run: Path, dataset: Dataset, tmp_path: Pat
         evaluate(run, cell=-1.0)
     with pytest.raises(DatasetError):
         evaluate(run, truth=tmp_path / "nowhere.txt")
-    short = tmp_path / "short.txt"
-    assert dataset.T_world_camera_true is not None
-    trajectory.write_tum(short, dataset.stamps[:3], dataset.T_world_camera_true[:3])
-    with pytest.raises(RunError, match=r"stamp 5\.000000"):
-        evaluate(run, truth=short)
+    with pytest.raises(OptionError, match="max_gap"):
+        evaluate(run, max_gap=float("nan"))
     with pytest.raises(RunError, match="no such run folder"):
         evaluate(tmp_path / "nothing")
 
@@ -195,5 +291,7 @@ def test_the_verb_prints_one_object_or_a_table(
     told = json.loads(capsys.readouterr().out)
     assert told["runs"][0]["metrics"]["translation_mae"]["unit"] == "m"
     assert verb.run(verb.Arguments(runs=(run,))) == 0
-    assert "Translation, mean absolute error" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "Translation, mean absolute error" in told
+    assert "against the truth, frame 0 put onto it." in told and "frames have truth" not in told
     assert verb.run(verb.Arguments(runs=())) == 2

@@ -234,7 +234,8 @@ def test_a_run_is_no_source(run: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert cli.main(["register", str(run), "--out", str(tmp_path / "out")]) == 1
     assert f"{run}: a run of depthba, expected a dataset" in capsys.readouterr().err
     assert cli.main(["convert", str(run), str(tmp_path / "out")]) == 1
-    assert f"{run}: a run, expected a dataset; or --to NAME" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"{run}: a run, expected a dataset; or say what" in told and "--to colmap" in told
     assert list(tmp_path.iterdir()) == []
 
 
