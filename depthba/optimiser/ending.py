@@ -124,7 +124,8 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
-        tied = None if bent or finer < level.grid.spacing else outcome.tied
+        new = bent or finer < level.grid.spacing or engine.doubted
+        tied = None if new else outcome.tied
         if bent and there.believed is not None:
             taken = trail.next(engine.bend, there.believed.pattern)
             before = _on_trial(engine, before, end, there, taken)
