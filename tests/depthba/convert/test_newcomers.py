@@ -92,7 +92,7 @@ def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
         (lines(scalar_first), r"expected --quaternions wxyz, or --unchecked"),
         (
             lines(lambda r: [r[0], *(f"{1000 * float(v):.6f}" for v in r[1:4]), *r[4:]]),
-            r"expected --pose-scale 0.001 \(or --depth-scale 1\), or --unchecked",
+            r"expected --pose-scale 0.001 \(points .*\), or --depth-scale 1 \(.*\), or --unchecked",
         ),
         (
             lines(lambda r: [word.replace(".", ",") for word in r]),
