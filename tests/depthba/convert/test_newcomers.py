@@ -78,7 +78,7 @@ def stamped(path: Path) -> None:
         stamped,
         lambda path: path.rename(path.with_name("a folder, with spaces")),
     ],
-    ids=["Windows' lines", "mark", "UTF-16", "commas", "stamps of another clock", "spaces"],
+    ids=["Windows' lines", "mark", "UTF-16", "commas", "numbered poses", "spaces"],
 )
 def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
     change(bare(tmp_path / "set"))
@@ -125,6 +125,7 @@ def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
             lambda p: shutil.copy(p / "depth/000003.png", p / "depth/000004.png"),
             r"4 poses for 5 frames \(000000.png to 000004.png\), expected one each, or images",
         ),
+        (lambda p: (p / "poses.txt").write_text("# stamp\n"), r"expected lines 'stamp tx ty tz qx"),
         (pictures(lambda z: (z / 8).astype(np.uint8)), r"type uint8, .* export the depth itself"),
         (
             pictures(lambda z: np.dstack([z / 8] * 3).astype(np.uint8)),
