@@ -176,7 +176,7 @@ def _other_unit(named: Array, stamps: Array, max_gap: float) -> str:
 def _cover(stamps: Array, of: Array, max_gap: float) -> bool:
     """Tell whether most stamps lie among others and span about as much."""
     spans = np.ptp(stamps), np.ptp(of)
-    return _share_among(stamps, of, max_gap) > 0.5 and 10 * min(spans) >= max(spans)
+    return bool(_share_among(stamps, of, max_gap) > 0.5 and 10 * min(spans) >= max(spans))
 
 
 def _missing(names: Sequence[str], poses: int) -> str:
