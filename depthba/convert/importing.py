@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import __version__
-from depthba.convert import files, overlap, registry
+from depthba.convert import files, overlap, registry, steps
 from depthba.convert.reading import Reading
 from depthba.convert.recording import Recording, SourceFrame
 from depthba.dataset import Dataset, DatasetWriter, is_dataset
@@ -41,8 +41,8 @@ def read(path: Path, reading: Reading) -> Recording:
     """Read a source, by the conventions of its format or those given, and check them.
 
     Raises:
-        DatasetError: it is of no known format, or of several; a file is missing or wrong; or its
-            frames overlap under another convention.
+        DatasetError: it is of no known format, or of several; a file is missing or wrong; depth
+            was rounded to a few whole numbers; or its frames overlap under another convention.
         OptionError: an option makes no sense.
 
     """
@@ -60,6 +60,7 @@ def read(path: Path, reading: Reading) -> Recording:
         raise DatasetError(f"{path}: {error}, expected files that can be read") from error
     if reading.unchecked:
         return replace(recording, notes=(*recording.notes, "conventions not checked"))
+    steps.refuse_whole_numbers(recording)  # they agree a little under many a unit
     return replace(recording, notes=(*recording.notes, *overlap.check(recording)[1]))
 
 
@@ -71,7 +72,8 @@ def into_dataset(
     Frames whose intrinsics differ become clouds: a dataset has one camera.
 
     Raises:
-        DatasetError: something is in the way, or an image is missing or wrong.
+        DatasetError: something is in the way, an image is missing or wrong, or depth is so small
+            that its steps would leave little of it.
 
     """
     notes = list(recording.notes)
@@ -84,10 +86,12 @@ def into_dataset(
     if as_clouds or camera is None:
         sensor["origin"] = recording.origin
     else:
-        scale = recording.depth_scale
+        scale = None if recording.floats else recording.depth_scale
         if scale is None:
             scale = _step(recording)
             notes.append(f"depth kept in steps of {scale:g} m")
+        if not reading.unchecked:
+            steps.refuse_coarse(recording, scale)
         sensor |= {"kind": "depth", **camera.json(), "depth_scale": scale}
     header = {
         "name": recording.path.resolve().stem or recording.format,

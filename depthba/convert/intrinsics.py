@@ -14,6 +14,11 @@ from depthba.errors import DatasetError
 NAMES = ("camera_intrinsic.json", "camera.json", "intrinsic.json", "intrinsics.json")
 """Under which Open3D's tools and ours leave `PinholeCameraIntrinsic`."""
 
+_UNLIKE, _ALIKE = 1.3, 1.1
+"""Focal lengths in x and y of one camera are equal but for a few percent."""
+_CENTRAL = 0.05
+"""Of the image: a principal point lies that near the middle, mostly."""
+
 
 def camera_of(
     path: Path, first: Path, reading: Reading, published: Camera | None = None, why: str = ""
@@ -35,6 +40,8 @@ def camera_of(
     distortion = reading.distortion or (0.0,) * 5
     if reading.intrinsics is not None:
         camera = made(width, height, reading.intrinsics, distortion, "--intrinsics")
+        if not reading.unchecked:
+            _refuse_other_order(camera)
         if not (0 <= camera.cx < width and 0 <= camera.cy < height) and not reading.unchecked:
             raise DatasetError(
                 f"--intrinsics: cx {camera.cx:g}, cy {camera.cy:g} lies outside of images of "
@@ -57,6 +64,36 @@ def camera_of(
     if reading.distortion is not None:
         return made(width, height, pinhole(known), distortion, "--distortion")
     return known
+
+
+def _refuse_other_order(camera: Camera) -> None:
+    """Refuse intrinsics that look wrong as given, and right in another order.
+
+    Raises `DatasetError`. Lenses that differ by so much between x and y, or whose centre lies so
+    far off, are let pass where no other order makes them look as those of a camera do.
+    """
+    fx, fy, cx, cy = lens = pinhole(camera)
+    given = "--intrinsics " + " ".join(f"{value:g}" for value in lens)
+    ratio = max(fx, fy) / min(fx, fy)
+    # fx cx fy cy, taken for fx fy cx cy: what is here called cx is fy, and fy is cx
+    if ratio > _UNLIKE and max(fx, cx) < _ALIKE * min(fx, cx) and _central(camera, fy, cy):
+        larger, smaller = ("fx", "fy") if fx > fy else ("fy", "fx")
+        raise DatasetError(
+            f"{given}: {larger} is {ratio:.2g} times {smaller}, expected fx fy cx cy, not fx cx fy "
+            "cy? or --unchecked"
+        )
+    off = min(abs(cx / camera.width - 0.5), abs(cy / camera.height - 0.5))
+    if off > 2 * _CENTRAL and _central(camera, cy, cx):
+        raise DatasetError(
+            f"{given}: cx {cx:g}, cy {cy:g} in images of {camera.width} x {camera.height} pixels, "
+            "expected fx fy cx cy, not fx fy cy cx? or --unchecked"
+        )
+
+
+def _central(camera: Camera, cx: float, cy: float) -> bool:
+    """Tell whether a point lies near the middle of the image, as principal points do."""
+    x, y = cx / camera.width - 0.5, cy / camera.height - 0.5
+    return max(abs(x), abs(y)) < _CENTRAL
 
 
 def pinhole(camera: Camera) -> tuple[float, float, float, float]:

@@ -34,6 +34,11 @@ ENOUGH, NOTICEABLE = 0.7, 0.1
 """Below the one, other units are looked at; by the other more of the points is worth a word."""
 LITTLE = 0.25
 """Frames of one scene agree in more."""
+SURE = 0.5
+"""That much is not by chance: poses of other frames, or wrong intrinsics, are not in question."""
+SEEN = (0.05, 300.0)
+"""How far away depth cameras see, m: of two units the one that leaves points there is named first.
+"""
 AS_GOOD = 0.8
 """With that part of the declared convention's share, another is as good."""
 
@@ -69,19 +74,19 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
         return verdict, ("too few points or poses to see whether the conventions are right",)
     if verdict.best != declared:
         # a mixture of wrong things may explain poses of other frames by chance
-        unsure = verdict.best_share < 0.5
+        unsure = verdict.best_share < SURE
         doubt = "; or are the poses those of other frames, the intrinsics right?" if unsure else ""
         raise DatasetError(
             f"{recording.path}: frames agree in {verdict.share:.0%} of their points with "
             f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
-            f"expected {_options(declared, verdict.best, recording)}, or --unchecked{doubt}"
+            f"expected {_options(verdict.best, recording, verdict.reach)}, or --unchecked{doubt}"
         )
     finer = relief.better(recording, FACTORS)
     if finer is not None:
         raise DatasetError(
             f"{recording.path}: the ground that frames share differs {finer.ratio:.3g} times as "
             f"much as with poses {finer.convention.scale / declared.scale:g} times as large: "
-            f"expected {_options(declared, finer.convention, recording)}, or --unchecked"
+            f"expected {_options(finer.convention, recording, verdict.reach)}, or --unchecked"
         )
     notes: tuple[str, ...] = (
         f"frames agree in {verdict.share:.0%} of their points with {declared}",
@@ -96,12 +101,13 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
         notes = (f"{notes[0]}; the overlap cannot tell that from {others}",)
     if verdict.rescaled is not None:
         other, found = verdict.rescaled
-        options = _options(declared, other, recording)
+        options = _options(other, recording, verdict.reach)
         notes += (f"with {options} they would agree in {found:.0%}: are the units right?",)
     span = float(np.linalg.norm(np.ptp(recording.T_world_camera[:, :3, 3], axis=0)))
     return verdict, (
         *notes,
-        f"points lie about {verdict.reach:.3g} m from the cameras, whose places span {span:.3g} m",
+        f"points lie about {_short(verdict.reach)} m from the cameras, "
+        f"whose places span {_short(span)} m",
     )
 
 
@@ -122,11 +128,13 @@ def judge(recording: Recording) -> Verdict:
             if _moves(pairs, recording.poses, c)
         }
     best = max(others, key=lambda c: others[c], default=declared)
-    if best == declared or others[best] <= least:
-        reach = float(np.median([pair.reach for pair in pairs]))
-        rescaled = _rescaled(pairs, recording.poses, declared, share) if share < ENOUGH else None
-        return Verdict(share, declared, share, as_good, reach, rescaled)
-    return Verdict(share, best, others[best])
+    reach = float(np.median([pair.reach for pair in pairs]))
+    if best != declared and others[best] > least:
+        return Verdict(share, best, _paired_anew(recording, best, others[best]), (), reach)
+    rescaled = _rescaled(pairs, recording, share) if share < ENOUGH else None
+    if rescaled is not None and share < LITTLE and rescaled[1] >= max(SURE, least):
+        return Verdict(share, *rescaled, (), reach)
+    return Verdict(share, declared, share, as_good, reach, rescaled)
 
 
 def _share(pairs: list[Pair], poses: Array, convention: Convention) -> float:
@@ -141,14 +149,27 @@ def _share(pairs: list[Pair], poses: Array, convention: Convention) -> float:
     return float(np.mean(list(shares.values())))
 
 
+def _paired_anew(recording: Recording, convention: Convention, share: float) -> float:
+    """Return the share of a convention over pairs that are neighbours by it, if that is more.
+
+    By wrong units pairs are chosen that in truth are far apart, or have hardly moved.
+    """
+    pairs = list(frame_pairs.pairs(replace(recording, convention=convention)))
+    return max(share, _share(pairs, recording.poses, convention)) if pairs else share
+
+
 def _rescaled(
-    pairs: list[Pair], poses: Array, declared: Convention, share: float
+    pairs: list[Pair], recording: Recording, share: float
 ) -> tuple[Convention, float] | None:
     """Return the convention of other units that does noticeably better, and its share."""
+    declared, poses = recording.convention, recording.poses
     others = [replace(declared, scale=declared.scale * factor) for factor in FACTORS]
     found = {c: _share(pairs, poses, c) for c in others if _moves(pairs, poses, c)}
     best = max(found, key=lambda c: found[c], default=declared)
-    return (best, found[best]) if found and found[best] > share + NOTICEABLE else None
+    if not found or found[best] <= share + NOTICEABLE:
+        return None
+    best_share = _paired_anew(recording, best, found[best])
+    return (best, best_share) if best_share > GOOD else None  # little says nothing of units
 
 
 def _moves(pairs: list[Pair], poses: Array, convention: Convention) -> bool:
@@ -176,7 +197,12 @@ def _reordered(declared: Convention) -> Iterator[Convention]:
     yield from (other, *_others(other, (1.0,)))
 
 
-def _options(declared: Convention, best: Convention, recording: Recording) -> str:
+def _options(best: Convention, recording: Recording, reach: float) -> str:
+    """Return the options that lead to a convention; for other units, how far away points are then.
+
+    Units of depth and of poses can both be what is wrong: the size of the scene tells which.
+    """
+    declared = recording.convention
     words = []
     if best.axes != declared.axes:
         words.append(f"--axes {best.axes}")
@@ -184,9 +210,17 @@ def _options(declared: Convention, best: Convention, recording: Recording) -> st
         words.append(f"--direction {best.direction}")
     if best.quaternions != declared.quaternions:
         words.append(f"--quaternions {best.quaternions}")
-    if best.scale != declared.scale:
-        words.append(f"--pose-scale {best.scale:g}")
-        if recording.depth_scale is not None:
-            factor = best.scale / declared.scale
-            words.append(f"(or --depth-scale {recording.depth_scale / factor:g})")
-    return " ".join(words)
+    if best.scale == declared.scale:
+        return " ".join(words)
+    factor = best.scale / declared.scale
+    units = [(f"--pose-scale {best.scale:g}", reach)]
+    if recording.depth_scale is not None:
+        units.insert(0, (f"--depth-scale {recording.depth_scale / factor:g}", reach / factor))
+        units.sort(key=lambda unit: not SEEN[0] <= unit[1] <= SEEN[1])
+    told = ", or ".join(f"{option} (points {_short(away)} m away)" for option, away in units)
+    return f"{' '.join(words)} with {told}" if words else told
+
+
+def _short(value: float) -> str:
+    """Return a number of three digits, without an exponent where it is not far from 1."""
+    return f"{float(f'{value:.3g}'):g}"

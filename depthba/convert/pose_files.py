@@ -64,7 +64,7 @@ def read(path: Path) -> Poses:
     """
     rows = _rows(path)
     if not rows:
-        raise DatasetError(f"{path}: no poses in it")
+        raise DatasetError(f"{path}: no poses in it, expected lines '{_FIELDS}'")
     widths = {len(row) for _, row in rows}
     if widths == {8}:
         return _tum(path, rows)

@@ -103,7 +103,9 @@ class Recording:
     frames: tuple[SourceFrame, ...]
     convention: Convention = Convention()
     depth_scale: float | None = None
-    """Metres per step of the depth images; None: they are not integers, or there are none."""
+    """Metres per unit of the depth images, as `--depth-scale` gives it; None: there are none."""
+    floats: bool = False
+    """Whether they hold floating-point numbers, which have no step to be kept in."""
     model: str = ""
     origin: bool = True
     """Clouds: whether the rays start at the origin of the sensor frame."""

@@ -90,7 +90,8 @@ def read(path: Path, reading: Reading) -> Recording:
         path,
         "ros-bag",
         tuple(frames),
-        depth_scale=None if encoding == "32FC1" else unit,
+        depth_scale=unit,
+        floats=encoding == "32FC1",
         notes=(*notes, f"depth from {topic} ({encoding}, {unit:g} m a unit)"),
     )
 

@@ -63,7 +63,8 @@ def read(path: Path, reading: Reading) -> Recording:
         path,
         "depth-folder",
         tuple(frames),
-        depth_scale=None if floats else scale,
+        depth_scale=scale,
+        floats=floats,
         notes=(*notes, f"poses from {poses.path.name}"),
     )
 

@@ -79,7 +79,8 @@ def read(path: Path, reading: Reading) -> Recording:
         "nerfstudio",
         tuple(frames),
         CONVENTION,
-        depth_scale=None if floats else scale,
+        depth_scale=scale,
+        floats=floats,
         notes=left_out(without, "no depth_file_path"),
     )
 

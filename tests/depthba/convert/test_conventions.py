@@ -33,10 +33,14 @@ def folder(path: Path, convention: Convention) -> Path:
     [
         (Convention(axes="opengl"), "expected --axes opengl, or --unchecked"),
         (Convention(direction="world-to-camera"), "expected --direction world-to-camera, or"),
-        (Convention(scale=0.001), "expected --pose-scale 0.001 (or --depth-scale 1), or"),
+        (
+            Convention(scale=0.001),
+            "expected --pose-scale 0.001 (points 1.03 m away), or --depth-scale 1 (points 1030 m "
+            "away), or --unchecked",
+        ),
         (
             Convention("opengl", "world-to-camera", 0.001),
-            "--axes opengl --direction world-to-camera --pose-scale 0.001 (or",
+            "--axes opengl --direction world-to-camera with --pose-scale 0.001 (points ",
         ),
     ],
 )
@@ -57,7 +61,7 @@ def test_a_wrong_convention_is_named(meant: Convention, told: str, tmp_path: Pat
 
 def test_a_wrong_unit_of_depth_is_named(tmp_path: Path) -> None:
     path = folder(tmp_path / "set", Convention())
-    with pytest.raises(DatasetError, match=r"or --depth-scale 0.001\)"):
+    with pytest.raises(DatasetError, match=r"expected --depth-scale 0.001 \(points .*, or --pose-"):
         importing.read(path, replace(READING, depth_scale=1 / 5000))
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from depthba import cli
-from depthba.convert import Reading, importing
+from depthba.convert import Reading, importing, intrinsics
 from depthba.dataset import Dataset
 from depthba.errors import DatasetError, OptionError
 from depthba.trajectory import write_tum
@@ -78,7 +78,7 @@ def stamped(path: Path) -> None:
         stamped,
         lambda path: path.rename(path.with_name("a folder, with spaces")),
     ],
-    ids=["Windows' lines", "mark", "UTF-16", "commas", "stamps of another clock", "spaces"],
+    ids=["Windows' lines", "mark", "UTF-16", "commas", "numbered poses", "spaces"],
 )
 def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
     change(bare(tmp_path / "set"))
@@ -92,7 +92,7 @@ def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
         (lines(scalar_first), r"expected --quaternions wxyz, or --unchecked"),
         (
             lines(lambda r: [r[0], *(f"{1000 * float(v):.6f}" for v in r[1:4]), *r[4:]]),
-            r"expected --pose-scale 0.001 \(or --depth-scale 1\), or --unchecked",
+            r"expected --pose-scale 0.001 \(points .*\), or --depth-scale 1 \(.*\), or --unchecked",
         ),
         (
             lines(lambda r: [word.replace(".", ",") for word in r]),
@@ -125,6 +125,7 @@ def test_what_is_harmless_is_taken(change: Change, tmp_path: Path) -> None:
             lambda p: shutil.copy(p / "depth/000003.png", p / "depth/000004.png"),
             r"4 poses for 5 frames \(000000.png to 000004.png\), expected one each, or images",
         ),
+        (lambda p: (p / "poses.txt").write_text("# stamp\n"), r"expected lines 'stamp tx ty tz qx"),
         (pictures(lambda z: (z / 8).astype(np.uint8)), r"type uint8, .* export the depth itself"),
         (
             pictures(lambda z: np.dstack([z / 8] * 3).astype(np.uint8)),
@@ -185,6 +186,45 @@ def test_intrinsics_of_another_size_are_noticed(tmp_path: Path) -> None:
     other = replace(READING, intrinsics=(525.0, 525.0, 319.5, 239.5))
     with pytest.raises(DatasetError, match="outside of images of 80 x 60 pixels: expected fx fy"):
         importing.read(bare(tmp_path / "set"), other)
+
+
+@pytest.mark.parametrize(
+    ("lens", "told"),
+    [
+        ((80.0, 39.5, 80.0, 29.5), "fx is 2 times fy, expected fx fy cx cy, not fx cx fy cy?"),
+        ((300.0, 39.1, 303.0, 30.2), "fx is 7.7 times fy, expected fx fy cx cy, not fx cx fy cy?"),
+        ((28.0, 39.5, 28.0, 29.5), "fy is 1.4 times fx, expected fx fy cx cy, not fx cx fy cy?"),
+        (
+            (80.0, 80.0, 29.5, 39.5),
+            "cx 29.5, cy 39.5 in images of 80 x 60 pixels, expected fx fy cx cy, not fx fy cy cx?",
+        ),
+    ],
+)
+def test_intrinsics_in_another_order_are_noticed(
+    lens: tuple[float, float, float, float], told: str, tmp_path: Path
+) -> None:
+    path, other = bare(tmp_path / "set"), replace(READING, intrinsics=lens)
+    with pytest.raises(DatasetError) as caught:
+        importing.read(path, other)
+    given = " ".join(f"{value:g}" for value in lens)
+    assert str(caught.value) == f"--intrinsics {given}: {told} or --unchecked"
+    importing.read(path, replace(other, unchecked=True))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        (40.0, 40.0, 39.5, 29.5),  # a wide lens: fx is about cx
+        (80.0, 50.0, 39.5, 29.5),  # stretched
+        (80.0, 80.0, 20.0, 45.0),  # cut out of a larger image
+        (42.0, 30.0, 41.0, 29.5),  # wide, and stretched
+    ],
+)
+def test_rare_lenses_are_let_pass(lens: tuple[float, float, float, float], tmp_path: Path) -> None:
+    """By their numbers; whether frames overlap with them is another matter."""
+    images = bare(tmp_path / "set") / "depth/000000.png"
+    camera = intrinsics.camera_of(images.parent, images, replace(READING, intrinsics=lens))
+    assert intrinsics.pinhole(camera) == lens
 
 
 def test_sizes_are_told_for_people_to_judge(tmp_path: Path) -> None:

@@ -70,8 +70,10 @@ def test_depth_that_is_too_large_is_named_with_the_factor(
     assert overlap.judge(recording).best == Convention()  # which the points alone do not tell
     with pytest.raises(DatasetError) as caught:
         overlap.check(recording)
-    told = f"expected --pose-scale {factor:g} (or --depth-scale {unit}), or --unchecked"
-    assert told in str(caught.value)
+    told = str(caught.value)
+    assert f"expected --depth-scale {unit} (points 1.0" in told
+    assert f" m away), or --pose-scale {factor:g} (points " in told
+    assert told.endswith(" m away), or --unchecked")
     assert "\n" not in str(caught.value)
 
 
@@ -106,5 +108,35 @@ def test_convert_names_the_unit_of_a_folder(
     words += ["80", "80", "39.5", "29.5", "--depth-scale"]
     assert cli.main([*words, "0.001"]) == 1
     told = capsys.readouterr().err
-    assert "expected --pose-scale 10 (or --depth-scale 0.0001), or --unchecked" in told
+    assert "expected --depth-scale 0.0001 (points 1.0" in told
+    assert " m away), or --pose-scale 10 (points 10." in told
     assert cli.main([*words, "0.0001"]) == 0
+
+
+def far_apart(factor: float, count: int) -> Recording:
+    """Return frames along a long way, in an order that is not the way's, depth off by a factor."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for k in rng.permutation(count):
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[:3, :3] = se3.exp_so3(rng.uniform(-0.35, 0.35, 3)) @ T[:3, :3]
+        T[:3, 3] = 0.12 * k, rng.uniform(-0.1, 0.1), rng.uniform(0.8, 1.2)
+        z = factor * ray_cast(T, bumpy)
+        frames.append(
+            SourceFrame(f"{k}", float(k), T, depth=lambda z=z: z, camera=CAMERA)  # type: ignore[misc]
+        )
+    return Recording(Path("way"), "depth-folder", tuple(frames), depth_scale=0.001 * factor)
+
+
+@pytest.mark.parametrize("count", [10, 12, 16])
+def test_the_share_under_other_units_is_that_of_neighbours_by_them(count: int) -> None:
+    """Else frames that are far apart are told to agree in little, and good data are doubted."""
+    right = overlap.judge(far_apart(1.0, count)).share
+    recording = far_apart(10.0, count)
+    verdict = overlap.judge(recording)
+    assert verdict.best == Convention(scale=10.0)
+    assert verdict.best_share == pytest.approx(right, abs=1e-9)
+    assert right > 0.5
+    with pytest.raises(DatasetError) as caught:
+        overlap.check(recording)
+    assert "are the poses those of other frames" not in str(caught.value)
