@@ -118,8 +118,8 @@ def plot(live: list[dict[str, Any]], large: dict[str, Any] | None, path: Path) -
         names = list(large["stages"])
         axes[2].barh(names[::-1], [large["stages"][n][1] for n in names[::-1]], color="tab:green")
         axes[2].set(
-            xlabel="most memory so far at the end of a stage, GB",
-            title=f"{large['frames']} frames, {large['points'] / 1e6:.1f} M points",
+            xlabel="most memory so far, GB",
+            title=f"{large['frames']} frames, {large['points'] / 1e6:.1f} M points, by stage",
         )
     for axis in axes:
         axis.grid(True, alpha=0.25)
