@@ -87,7 +87,7 @@ def read_array(data: bytes) -> NDArray[Any]:
     there = len(data) - file.tell()
     if dtype.hasobject:
         raise ValueError("an array of objects, expected numbers")
-    if min(shape, default=0) < 0 or size != there:
+    if any(type(n) is not int for n in shape) or min(shape, default=0) < 0 or size != there:
         raise ValueError(f"{there} bytes of numbers, expected {size} for the shape {shape}")
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

@@ -37,6 +37,8 @@ def camera_of(
 
     """
     width, height = files.image_size(first)
+    if not width or not height:
+        raise DatasetError(f"{first}: {width} x {height} pixels, expected an image")
     distortion = reading.distortion or (0.0,) * 5
     if reading.intrinsics is not None:
         camera = made(width, height, reading.intrinsics, distortion, "--intrinsics")

@@ -74,7 +74,8 @@ def read(path: Path) -> Poses:
         return Poses(path, T, None)
     if widths <= {3, 4}:
         return Poses(path, _matrices(path, rows), None)
-    at, row = next((at, row) for at, row in rows if len(row) not in (8, 12))
+    usual = len(rows[0][1])
+    at, row = next((at, row) for at, row in rows if len(row) not in (8, 12) or len(row) != usual)
     raise DatasetError(
         f"{path}: line {at}: {len(row)} numbers{_guess(path, at, len(row))}, expected 8 (TUM: "
         "stamp tx ty tz qx qy qz qw), 12 (KITTI) or 4x4 matrices"

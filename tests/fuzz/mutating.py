@@ -252,7 +252,7 @@ def of_png(rng: random.Random, data: bytes) -> bytes:
 
 def of_npy(rng: random.Random, data: bytes) -> bytes:
     """Change the head of an array, which says its shape and type."""
-    if rng.random() < 0.3 or data[:6] != b"\x93NUMPY":
+    if rng.random() < 0.3 or len(data) < 10 or data[:6] != b"\x93NUMPY":
         return of_bytes(rng, data)
     shapes = ("()", "(1,)", "(0, 8)", "(6, 8)", "(100000, 100000)", "(99999999999999999999,)")
     shapes += ("(-1,)", "(2, 2, 2)", "(1.5,)", "None", "(" * 100, "(True,)")
