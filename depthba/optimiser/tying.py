@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser.layers import rough_points
-from depthba.optimiser.patches import Cloud, Fit, lay
+from depthba.optimiser.laying import Cloud, lay
+from depthba.optimiser.patches import Fit
 from depthba.optimiser.prior import PosePrior, move
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import Workers

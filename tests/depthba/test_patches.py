@@ -9,7 +9,8 @@ import pytest
 
 from depthba import se3
 from depthba.optimiser import tying
-from depthba.optimiser.patches import Cloud, Patches, lay
+from depthba.optimiser.laying import Cloud, lay
+from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import move
 from depthba.optimiser.tying import FAR, patches_beside
 from depthba.optimiser.workers import Workers

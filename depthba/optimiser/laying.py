@@ -1,0 +1,205 @@
+"""Lays patches over points: finds in which voxels several frames see something with a side.
+
+Points are sorted into voxels; which way a patch faces is read from the scatter *within* frames,
+which misaligned poses do not blur.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from depthba.optimiser import laying_kernels, patch_kernels
+from depthba.optimiser.asking import look
+from depthba.optimiser.patches import Fit, Patches
+from depthba.optimiser.problem import Problem
+from depthba.optimiser.workers import Workers
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Fewest points of a frame in a patch, and fewest frames.
+FEWEST, SEVERAL = 6, 2
+# The second axis of a patch is at least this many times its thickness, and this share of the voxel.
+FLAT, WIDE = 2.0, 0.1
+# How far a point is walked to its surface at most, in sides of its voxel.
+REACH = 0.5
+# Voxels of the box around all points, per point, above which they are sorted and not counted.
+SPARSE = 8.0
+# Rounds of reweighting in a fit that starts from nothing.
+AFRESH = 4
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of all frames, some of which may lie on patches."""
+
+    points: Array
+    """(n, 3), sensor frame, m."""
+    weights: Array
+    """(n,), inverse variance relative to the typical one."""
+    frame: Ints
+    """(n,)."""
+    source: Ints
+    """(n,), index of each point among those of its frame."""
+    rays: bool
+    """Whether points lie on rays from the origin of their sensor."""
+
+    @staticmethod
+    def of(problem: Problem) -> Cloud:
+        """Return all points of a problem."""
+        parts = [f.points for f in problem.frames]
+        return Cloud(
+            np.concatenate([p[:, :3] for p in parts]).astype(np.float64),
+            np.concatenate([p[:, 3] for p in parts]).astype(np.float64) ** 2,
+            np.repeat(np.arange(len(parts)), [len(p) for p in parts]),
+            np.concatenate([np.arange(len(p)) for p in parts]),
+            problem.origin,
+        )
+
+    def weighed(self, factor: Array) -> Cloud:
+        """Return the points with their weights times a factor (n,), without those of none."""
+        k = factor > 0
+        return replace(
+            self,
+            points=self.points[k],
+            weights=factor[k] * self.weights[k],
+            frame=self.frame[k],
+            source=self.source[k],
+        )
+
+
+def lay(
+    cloud: Cloud, T_map_camera: Array, sides: tuple[float, ...], robust: float, sigma: float,
+    workers: Workers,
+) -> Fit:  # fmt: skip
+    """Lay patches over points, in voxels of the first side; where there is none, of the next.
+
+    Args:
+        cloud: the points.
+        T_map_camera: (N, 4, 4), where to lay them.
+        sides: of the voxels, m, descending.
+        robust: scale of the loss, in robust standard deviations of the residuals.
+        sigma: standard deviation of the points' noise, m.
+        workers: the threads.
+    """
+    n = len(T_map_camera)
+    x = np.empty_like(cloud.points)
+    laying_kernels.to_map(cloud.points, cloud.frame, T_map_camera, x)
+    left, parts = np.arange(len(x)), []
+    for side in sides:
+        look()
+        parts.append(_voxels(x, cloud, left, side))
+        left = parts[-1].left
+    order = np.concatenate([p.points for p in parts])
+    each = np.repeat(sides, [len(p.centre) for p in parts])
+    laid = Patches(
+        points=cloud.points[order],
+        weights=cloud.weights[order],
+        source=cloud.source[order],
+        ends=_ends([p.sizes for p in parts]),
+        frame=np.concatenate([p.frame for p in parts]),
+        views=_ends([p.views for p in parts]),
+        axes=np.concatenate([p.axes for p in parts]),
+        centre=np.concatenate([p.centre for p in parts]),
+        reach=REACH * each,
+        stiff=(sigma * each) ** 2,
+        surface=np.zeros((len(each), patch_kernels.TERMS)),
+        robust=robust,
+        scale=0.0,
+        rays=cloud.rays,
+        frames=n,
+    )
+    fit = Fit(laid, 0.0, np.zeros(len(order)))
+    for _ in range(AFRESH):
+        fit = fit.patches.fitted(T_map_camera, workers, 1).rescaled(sigma)
+    return fit
+
+
+def _ends(sizes: list[Ints]) -> Ints:
+    """Return where runs of the given sizes end, and a 0 before them."""
+    return np.concatenate([[0], np.cumsum(np.concatenate(sizes))])
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Patches in voxels of one side."""
+
+    points: Ints
+    """(n,), indices of the points on patches, by patch and by frame."""
+    sizes: Ints
+    """(m,), points of each view."""
+    frame: Ints
+    """(m,), its frame."""
+    views: Ints
+    """(k,), views of each patch."""
+    axes: Array
+    """(k, 3, 3)."""
+    centre: Array
+    """(k, 3)."""
+    left: Ints
+    """Indices of the points on none, ascending."""
+
+
+def _voxels(x: Array, cloud: Cloud, these: Ints, side: float) -> _Found:
+    """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m."""
+    if not len(these):
+        none = np.empty(0, np.int64)
+        return _Found(none, none, none, none, np.empty((0, 3, 3)), np.empty((0, 3)), these)
+    voxel, k = _voxel_of(x, these, side)
+    order = np.empty_like(these)
+    laying_kernels.sort_by(voxel, k, order)
+    look()
+    voxel, order = voxel[order], these[order]
+    frame = cloud.frame[order]
+    new = (voxel[1:] != voxel[:-1]) | (frame[1:] != frame[:-1])
+    begins = np.flatnonzero(np.concatenate([[True], new]))
+    voxel, frame = voxel[begins], frame[begins]
+    begins = np.append(begins, len(order))
+    m = len(frame)
+    weight, mean, spread = np.empty(m), np.empty((m, 3)), np.empty((m, 3, 3))
+    laying_kernels.moments(order, begins, x, cloud.weights, weight, mean, spread)
+    look()
+    many = np.diff(begins) >= FEWEST
+    several = np.bincount(voxel[many], minlength=k) >= SEVERAL
+    many &= several[voxel]
+    # from here on of the voxels that several frames see
+    on, k = (np.cumsum(several) - 1)[voxel[many]], int(several.sum())
+    total, pooled = np.bincount(on, weight[many], k), np.zeros((k, 3, 3))
+    np.add.at(pooled, on, spread[many])
+    values, axes = np.linalg.eigh(pooled)
+    good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    moment = [np.bincount(on, weight[many] * mean[many, a], k) for a in range(3)]
+    centre = np.stack(moment, axis=1) / np.maximum(total, 1e-300)[:, None]
+    chosen = np.zeros(m, bool)
+    chosen[np.flatnonzero(many)[good[on]]] = True
+    sizes = np.diff(begins)
+    taken = order[np.repeat(chosen, sizes)]
+    rest = np.zeros(len(x), bool)
+    rest[these] = True
+    rest[taken] = False
+    return _Found(
+        taken,
+        sizes[chosen],
+        frame[chosen],
+        np.bincount(on, minlength=k)[good],
+        axes[good],
+        centre[good],
+        np.flatnonzero(rest),
+    )
+
+
+def _voxel_of(x: Array, these: Ints, side: float) -> tuple[Ints, int]:
+    """Return the voxel of some points, numbered in order without gaps, and how many there are."""
+    least, most = np.empty(3, np.int64), np.empty(3, np.int64)
+    laying_kernels.extent(x, these, side, least, most)
+    key, spans = np.empty_like(these), most - least + 1
+    laying_kernels.number(x, these, side, least, spans, key)
+    if float(np.prod(spans.astype(float))) > SPARSE * len(key):
+        used, numbers = np.unique(key, return_inverse=True)
+        return numbers, len(used)
+    there = np.bincount(key) > 0
+    return (np.cumsum(there) - 1)[key], int(there.sum())

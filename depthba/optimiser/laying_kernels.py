@@ -1,0 +1,85 @@
+"""Sorting points into voxels, and their moments there."""
+
+from __future__ import annotations
+
+# mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
+import numba as nb
+import numpy as np
+
+
+@nb.njit(cache=True, nogil=True)
+def to_map(points, frame, T, out):
+    """Bring points (n, 3) of the given frames (n,) into the map frame."""
+    for i in range(len(points)):
+        pose = T[frame[i]]
+        for a in range(3):
+            out[i, a] = (
+                pose[a, 0] * points[i, 0]
+                + pose[a, 1] * points[i, 1]
+                + pose[a, 2] * points[i, 2]
+                + pose[a, 3]
+            )
+
+
+@nb.njit(cache=True, nogil=True)
+def extent(x, these, side, least, most):
+    """Fill ``least`` and ``most`` (3,) with the first and the last voxel of some points."""
+    for a in range(3):
+        least[a] = most[a] = np.int64(np.floor(x[these[0], a] / side))
+    for i in these:
+        for a in range(3):
+            c = np.int64(np.floor(x[i, a] / side))
+            least[a] = min(least[a], c)
+            most[a] = max(most[a], c)
+
+
+@nb.njit(cache=True, nogil=True)
+def number(x, these, side, least, spans, out):
+    """Write to ``out`` the number of each point's voxel in a box of ``spans`` (3,) voxels."""
+    for k in range(len(these)):
+        n = np.int64(0)
+        for a in range(3):
+            c = np.int64(np.floor(x[these[k], a] / side))
+            n = n * spans[a] + c - least[a]
+        out[k] = n
+
+
+@nb.njit(cache=True, nogil=True)
+def sort_by(bins, count, order):
+    """Write to ``order`` (n,) the points sorted by bin; the sort is stable."""
+    at = np.zeros(count + 1, np.int64)
+    for k in bins:
+        at[k + 1] += 1
+    for k in range(count):
+        at[k + 1] += at[k]
+    for i in range(len(bins)):
+        order[at[bins[i]]] = i
+        at[bins[i]] += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def moments(order, begins, x, w, weight, mean, spread):
+    """Fill weight, mean and scatter of every run of points, each of which ends where one begins."""
+    for j in range(len(weight)):
+        total = m0 = m1 = m2 = 0.0
+        for i in order[begins[j] : begins[j + 1]]:
+            total += w[i]
+            m0 += w[i] * x[i, 0]
+            m1 += w[i] * x[i, 1]
+            m2 += w[i] * x[i, 2]
+        m0, m1, m2 = m0 / total, m1 / total, m2 / total
+        s00 = s10 = s11 = s20 = s21 = s22 = 0.0
+        for i in order[begins[j] : begins[j + 1]]:
+            d0, d1, d2 = x[i, 0] - m0, x[i, 1] - m1, x[i, 2] - m2
+            s00 += w[i] * d0 * d0
+            s10 += w[i] * d1 * d0
+            s11 += w[i] * d1 * d1
+            s20 += w[i] * d2 * d0
+            s21 += w[i] * d2 * d1
+            s22 += w[i] * d2 * d2
+        weight[j] = total
+        mean[j, 0], mean[j, 1], mean[j, 2] = m0, m1, m2
+        spread[j, 0, 0], spread[j, 1, 1], spread[j, 2, 2] = s00, s11, s22
+        spread[j, 0, 1] = spread[j, 1, 0] = s10
+        spread[j, 0, 2] = spread[j, 2, 0] = s20
+        spread[j, 1, 2] = spread[j, 2, 1] = s21
