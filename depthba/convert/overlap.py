@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
-from depthba.convert import frame_pairs, relief
+from depthba.convert import columns, frame_pairs, relief
 from depthba.convert.frame_pairs import Pair
 from depthba.convert.reading import Axes, Direction, Quaternions
 from depthba.convert.recording import Convention, Recording
@@ -58,6 +58,9 @@ class Verdict:
     """Typical distance of the points from their camera, m."""
     rescaled: tuple[Convention, float] | None = None
     """One of other units that explains more of the points, though not clearly, and its share."""
+    held: str = columns.AS_READ
+    """What the columns of the positions hold where that, and no convention, explains the frames:
+    `best_share` is then by it."""
 
 
 def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
@@ -81,12 +84,26 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
             f"{declared}, but in {verdict.best_share:.0%} with {verdict.best}: "
             f"expected {_options(verdict.best, recording, verdict.reach)}, or --unchecked{doubt}"
         )
+    expected = f"expected {' '.join(columns.AS_READ)}, or --unchecked"
+    if verdict.held != columns.AS_READ:
+        raise DatasetError(
+            f"{recording.path}: frames agree in {verdict.share:.0%} of their points with "
+            f"{declared}, but in {verdict.best_share:.0%} if the columns of the positions hold "
+            f"{' '.join(verdict.held)}: {expected}"
+        )
     finer = relief.better(recording, FACTORS)
     if finer is not None:
         raise DatasetError(
             f"{recording.path}: the ground that frames share differs {finer.ratio:.3g} times as "
             f"much as with poses {finer.convention.scale / declared.scale:g} times as large: "
             f"expected {_options(finer.convention, recording, verdict.reach)}, or --unchecked"
+        )
+    other = relief.columns_held(recording)
+    if other is not None:
+        held, ratio = other
+        raise DatasetError(
+            f"{recording.path}: the ground that frames share differs {ratio:.3g} times as "
+            f"much as if the columns of the positions held {' '.join(held)}: {expected}"
         )
     notes: tuple[str, ...] = (
         f"frames agree in {verdict.share:.0%} of their points with {declared}",
@@ -100,8 +117,8 @@ def check(recording: Recording) -> tuple[Verdict, tuple[str, ...]]:
         others = ", or ".join(map(str, verdict.as_good))
         notes = (f"{notes[0]}; the overlap cannot tell that from {others}",)
     if verdict.rescaled is not None:
-        other, found = verdict.rescaled
-        options = _options(other, recording, verdict.reach)
+        rescaled, found = verdict.rescaled
+        options = _options(rescaled, recording, verdict.reach)
         notes += (f"with {options} they would agree in {found:.0%}: are the units right?",)
     span = float(np.linalg.norm(np.ptp(recording.T_world_camera[:, :3, 3], axis=0)))
     return verdict, (
@@ -131,6 +148,10 @@ def judge(recording: Recording) -> Verdict:
     reach = float(np.median([pair.reach for pair in pairs]))
     if best != declared and others[best] > least:
         return Verdict(share, best, _paired_anew(recording, best, others[best]), (), reach)
+    if share < SURE:
+        held, found = _by_columns(recording, pairs)
+        if found > least:
+            return Verdict(share, declared, found, (), reach, held=held)
     rescaled = _rescaled(pairs, recording, share) if share < ENOUGH else None
     if rescaled is not None and share < LITTLE and rescaled[1] >= max(SURE, least):
         return Verdict(share, *rescaled, (), reach)
@@ -170,6 +191,19 @@ def _rescaled(
         return None
     best_share = _paired_anew(recording, best, found[best])
     return (best, best_share) if best_share > GOOD else None  # little says nothing of units
+
+
+def _by_columns(recording: Recording, pairs: list[Pair]) -> tuple[str, float]:
+    """Return what the columns hold by which most of the points agree, and their share."""
+    found = {}
+    for held, other in columns.reordered(recording):
+        # in the wrong order, frames were taken for neighbours that are far apart
+        anew = list(frame_pairs.pairs(other))
+        found[held] = max(
+            _share(some, other.poses, other.convention) for some in (pairs, anew) if some
+        )
+    best = max(found, key=lambda held: found[held])
+    return best, found[best]
 
 
 def _moves(pairs: list[Pair], poses: Array, convention: Convention) -> bool:

@@ -1,13 +1,15 @@
-"""Whether the relief of the ground that two frames share fits better with poses in other units.
+"""Whether the relief of the ground that two frames share fits better with other poses.
 
 Over near-flat ground a depth that is too large by a factor puts plane on plane still, so that the
 points agree as well as with the right one. What does not agree is the relief: every frame has it
 in another place. So the heights of the one frame over the other are compared, less an offset and
 a tilt, which are what measured poses leave.
 
-Only poses that should move more are looked for. Where they should move less, that is where depth
-is too small, the overlap is destroyed; and a camera that stands still moves by nothing but the
-noise of its poses, of which less is better.
+The same is true of positions whose columns are in another order than they were read by.
+
+Of units, only poses that should move more are looked for. Where they should move less, that is
+where depth is too small, the overlap is destroyed; and a camera that stands still moves by nothing
+but the noise of its poses, of which less is better.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba import se3
+from depthba.convert import columns
 from depthba.convert.frame_pairs import (
     FEWEST,
     Fixed,
@@ -70,15 +73,32 @@ def better(recording: Recording, factors: Sequence[float]) -> Better | None:
     for factor in factors:
         if factor > 1.0:
             other = replace(declared, scale=declared.scale * factor)
-            ratio = _ratio(recording, fixed, other)
+            ratio = _ratio(recording, fixed, other.applied(recording.poses))
             if ratio >= RATIO:
                 found.append(Better(other, ratio))
     return max(found, key=lambda one: one.ratio, default=None)
 
 
-def _ratio(recording: Recording, fixed: Sequence[Fixed], other: Convention) -> float:
-    """Return how many times as much heights differ as with the other units; 0 if none can tell."""
-    T_declared, T_other = recording.T_world_camera, other.applied(recording.poses)
+def columns_held(recording: Recording) -> tuple[str, float] | None:
+    """Return what the columns of the positions hold where that fits far better; or None.
+
+    And how many times as much heights differ as they are read, median over pairs.
+    """
+    fixed = list(fixed_frames(recording))
+    found = {
+        held: _ratio(recording, fixed, other.T_world_camera)
+        for held, other in columns.reordered(recording)
+    }
+    best = max(found, key=lambda held: found[held])
+    return (best, found[best]) if found[best] >= RATIO else None
+
+
+def _ratio(recording: Recording, fixed: Sequence[Fixed], T_other: Array) -> float:
+    """Return how many times as much heights differ as with other poses; 0 if none can tell.
+
+    ``T_other``: (N, 4, 4), ``T_world_camera``.
+    """
+    T_declared = recording.T_world_camera
     ratios = []
     for at in fixed:
         j = neighbour(T_other, at.i, at.reach)

@@ -59,6 +59,19 @@ def test_a_wrong_convention_is_named(meant: Convention, told: str, tmp_path: Pat
     assert "conventions not checked" in unchecked.notes
 
 
+@pytest.mark.parametrize("columns", ["yxz", "xzy", "zxy"])
+def test_exchanged_columns_are_named(columns: str, tmp_path: Path) -> None:
+    path = folder(tmp_path / "set", Convention())
+    T = small_scene.poses()
+    written = T.copy()
+    written[:, :3, 3] = T[:, ["xyz".index(c) for c in columns], 3]
+    write_tum(path / "poses.txt", np.arange(6.0), written)
+    with pytest.raises(DatasetError) as caught:
+        importing.read(path, READING)
+    assert f"hold {' '.join(columns)}: expected x y z" in str(caught.value).replace("held", "hold")
+    assert "\n" not in str(caught.value)
+
+
 def test_a_wrong_unit_of_depth_is_named(tmp_path: Path) -> None:
     path = folder(tmp_path / "set", Convention())
     with pytest.raises(DatasetError, match=r"expected --depth-scale 0.001 \(points .*, or --pose-"):
