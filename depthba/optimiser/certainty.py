@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from depthba.optimiser import coupling, dense, pattern, probes, reduced
+from depthba.optimiser import coupling, dense, patch_waves, pattern, probes, reduced
 from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
@@ -91,6 +91,11 @@ def correlation(
             Ground(problem, grid, state, loss), lin, problem.waves, believed.found, groups, count,
             workers,
         )  # fmt: skip
+        if patches is not None and believed.found.surfaces is not None:
+            own = own + patch_waves.scores(
+                patches, state.T_map_camera, problem.waves, believed.found.surfaces, groups, count,
+                workers,
+            )  # fmt: skip
         scores = scores + believed.follow(own)
     if patches is not None:
         scores = scores + patches.scores(state.T_map_camera, lin.pivots, groups, count, workers)

@@ -11,16 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import certainty, pattern, reduced
+from depthba.optimiser import certainty, patch_waves, pattern, reduced
 from depthba.optimiser.bends import without_bends
 from depthba.optimiser.engine import End, Engine, Map
-from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
 from depthba.optimiser.problem import Problem
 
 # Times that the last level goes on.
-AGAIN = 8
+AGAIN = 12
+# Residuals more alike than this many times what independent ones would be are the map's to blame
+# for, too, which has one height per node. Patches beside it then count so many times, from one
+# settling to the next: less before the poses have settled, since patches hold what they tie.
+ALIKE = 1.5
+EMPHASIS = (1.0, 1.0, 2.0, 4.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
@@ -106,31 +110,37 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
     Returns where that ends, and what is known there if it was found out.
     """
     before: _Before | None = None
-    trail = Trail()
+    trail, emphasis = Trail(), 0
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
         if before is not None and there.inflation > before.share * before.inflation:
             engine.problem, engine.bend, engine.plain = before.problem, None, True
             engine.refused_pattern, end, before = before.size, before.end, None
             there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
+            emphasis, engine.emphasis = 0, EMPHASIS[0]
         known, outcome, level = there.correlation, end.outcome, end.level
         finer = engine.finer(level.grid.spacing, known, outcome)
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
         # a pattern may be what keeps the poses from settling
-        more = bent or (outcome.converged and (less or finer < level.grid.spacing))
+        alike = level.tied is not None and known.overall > ALIKE
+        firmer = alike and emphasis < len(EMPHASIS) - 1
+        more = firmer or bent or (outcome.converged and (less or finer < level.grid.spacing))
         if engine.clock.over or not more:
             return end, there
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
-        new = bent or finer < level.grid.spacing or engine.doubted
+        new = firmer or bent or finer < level.grid.spacing or engine.doubted
         tied = None if new else outcome.tied
         if bent and there.believed is not None:
             taken = trail.next(engine.bend, there.believed.pattern)
             before = _on_trial(engine, before, end, there, taken)
             level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
+        if firmer:
+            emphasis += 1
+            engine.emphasis = EMPHASIS[emphasis]
         if finer < level.grid.spacing:
             index += 1
             coarse = Map(state.heights, level.grid)
@@ -150,9 +160,9 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
         level = replace(level, tied=None)
     elif level.tied:
         # no point vouches twice
-        level = engine.patched(level, state, lin, 0.0)
+        level = engine.patched(level, state, lin, vouching=True)
     at = engine.with_patches(level, state, lin, at)
-    believed = _believed(engine, problem, level.grid, state, loss, lin, at)
+    believed = _believed(engine, problem, level, state, loss, lin, at)
     found = certainty.correlation(
         problem, level.grid, state, loss, lin, engine.prior, engine.free, workers, at, believed,
         level.tied.patches if level.tied else None,
@@ -162,7 +172,7 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
 
 
 def _believed(
-    engine: Engine, problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation,
+    engine: Engine, problem: Problem, level: Level, state: State, loss: Loss, lin: Linearisation,
     at: reduced.Reduction,
 ) -> pattern.Believed | None:  # fmt: skip
     """Return what the points say of the camera's fixed pattern; None: there is none."""
@@ -174,7 +184,11 @@ def _believed(
     if not variance:  # no point is left to ask: the map bends sharply everywhere
         return None
     matrix, _ = engine.acting.normal_equations(state.T_map_camera, lin.pivots)
-    found = pattern.answers(problem, grid, state, loss, lin, at, waves, engine.workers)
+    found = pattern.answers(problem, level.grid, state, loss, lin, at, waves, engine.workers)
+    if level.tied:
+        poses, patches = state.T_map_camera, level.tied.patches
+        told = patch_waves.told(patches, poses, lin.pivots, waves, engine.workers)
+        found = found.beside(told)
     believed = pattern.believe(
         found, at.S + variance * matrix, np.repeat(free, 6), now, pattern.CAUTION * variance
     )

@@ -97,6 +97,8 @@ class Engine:
     history: list[Iteration] = field(default_factory=list)
     bend: NDArray[np.float64] | None = None
     """(m,), m at a point of typical noise: what has been taken off the points; None: nothing."""
+    emphasis: float = 1.0
+    """How many times patches beside the map count."""
     plain: bool = False
     """Whether the camera was found to have no fixed pattern: it is not looked for again."""
     refused_pattern: float = 0.0
@@ -237,18 +239,22 @@ class Engine:
         return poses
 
     def patched(
-        self, level: Level, state: State, lin: Linearisation, shared: float = SHARED
+        self, level: Level, state: State, lin: Linearisation, vouching: bool = False
     ) -> Level:
         """Return the level with patches laid anew over what is steep.
 
-        ``shared``: weight of the points there that the map takes at their full weight, too.
+        ``vouching``: no point counts there that the map takes at its full weight, and none more
+        than once.
         """
         if not self.preset.robust:
             return replace(level, tied=None)
         tied = patches_beside(
             self.problem, state.T_map_camera, level.grid.spacing, self._fine(level.grid.spacing),
-            self.preset.robust, robust_sigma(lin.residuals), self.workers, shared,
+            self.preset.robust, robust_sigma(lin.residuals), self.workers,
+            0.0 if vouching else SHARED,
         )  # fmt: skip
+        if tied and not vouching:
+            tied = tied.counted(self.emphasis)
         return replace(level, tied=tied)
 
     def _fine(self, spacing: float) -> float:

@@ -36,7 +36,7 @@ POSE, SURFACE, ERROR, COLUMNS = 0, 6, 12, 16
 
 
 @nb.njit(cache=True, nogil=True)
-def _room(first, last, ends, views):
+def room(first, last, ends, views):
     """Return memory for the points of any of the patches."""
     most = 0
     for k in range(first, last):
@@ -70,7 +70,7 @@ def _turn_view(points, weights, Q, o, rays, s, at):
 
 
 @nb.njit(cache=True, nogil=True)
-def _place(k, points, weights, ends, views, Q, o, rays, s):
+def place(k, points, weights, ends, views, Q, o, rays, s):
     """Bring the points of a patch into its axes; return how many they are."""
     begin = ends[views[k]]
     for m in range(views[k], views[k + 1]):
@@ -80,7 +80,7 @@ def _place(k, points, weights, ends, views, Q, o, rays, s):
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _meet(n, q, rays, reach, s):
+def meet(n, q, rays, reach, s):
     """Walk the points of a patch to its surface: feet, slopes there, norms, how far they lie off.
 
     What the walk has not covered is left over at its end.
@@ -129,7 +129,7 @@ def _meet(n, q, rays, reach, s):
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _weigh(n, square, s):
+def weigh(n, square, s):
     """Say how much points count: Geman-McClure of squared scale, m^2; 0: no robust loss."""
     weight, norm2, off, counts = s[WEIGHT], s[NORM2], s[OFF], s[COUNTS]
     if square == 0.0:
@@ -155,7 +155,7 @@ def _charge(n, square, s, out):
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _surface_sums(n, s, M, b):
+def surface_sums(n, s, M, b):
     """Sum what points say of a surface: M (6, 6), its lower triangle, and b (6,).
 
     Products of terms are powers of u and v, of which there are fewer.
@@ -208,7 +208,7 @@ def _factor(M, L):
 
 
 @nb.njit(cache=True, nogil=True)
-def _forward(L, b):
+def forward(L, b):
     """Solve ``L x = b`` in place."""
     for i in range(6):
         for k in range(i):
@@ -217,7 +217,7 @@ def _forward(L, b):
 
 
 @nb.njit(cache=True, nogil=True)
-def _backward(L, b):
+def backward(L, b):
     """Solve ``L^T x = b`` in place."""
     for i in range(5, -1, -1):
         for k in range(i + 1, 6):
@@ -226,7 +226,7 @@ def _backward(L, b):
 
 
 @nb.njit(cache=True, nogil=True)
-def _firm(M, stiff, L):
+def firm(M, stiff, L):
     """Factor a surface's normal matrix; a term that no point holds is held by next to nothing."""
     for j in range(6):
         M[j, j] *= 1.0 + 1e-9
@@ -259,36 +259,36 @@ def fit(
         surface: (k, 6), where to start, and where it ends.
         off: (n,) gets how far every point lies off its surface, in units of its noise.
     """
-    s = _room(first, last, ends, views)
+    s = room(first, last, ends, views)
     b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     total = 0.0
     for k in range(first, last):
         q = surface[k]
-        n = _place(k, points, weights, ends, views, Q, o, rays, s)
+        n = place(k, points, weights, ends, views, Q, o, rays, s)
         for _ in range(rounds):
-            _meet(n, q, rays, reach[k], s)
-            _weigh(n, square, s)
-            _surface_sums(n, s, M, b)
+            meet(n, q, rays, reach[k], s)
+            weigh(n, square, s)
+            surface_sums(n, s, M, b)
             # the step goes to the coefficients themselves, which stiffness holds to nothing
             for i in range(6):
                 for j in range(i + 1):
                     b[i] += M[i, j] * q[j]
                     if i != j:
                         b[j] += M[i, j] * q[i]
-            _firm(M, stiff[k], L)
-            _forward(L, b)
-            _backward(L, b)
+            firm(M, stiff[k], L)
+            forward(L, b)
+            backward(L, b)
             for j in range(6):
                 q[j] = b[j]
         for j in range(3, 6):
             total += stiff[k] * q[j] * q[j]
-        _meet(n, q, rays, reach[k], s)
+        meet(n, q, rays, reach[k], s)
         total += _charge(n, square, s, off[ends[views[k]] :])
     return total
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _by_pose(J, i, s, pivot):
+def by_pose(J, i, s, pivot):
     """Derivative at a foot by a shift and a turn of the frame about its pivot, in patch axes."""
     n1, n2 = s[SLOPE_U, i], s[SLOPE_V, i]
     a0, a1, a2 = s[FOOT_0, i] - pivot[0], s[FOOT_U, i] - pivot[1], s[FOOT_V, i] - pivot[2]
@@ -297,7 +297,8 @@ def _by_pose(J, i, s, pivot):
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _by_surface(phi, i, s):
+def by_surface(phi, i, s):
+    """Derivative at a foot by the surface's coefficients, its sign turned."""
     u, v = s[FOOT_U, i], s[FOOT_V, i]
     phi[0], phi[1], phi[2] = 1.0, u, v
     phi[3], phi[4], phi[5] = u * u, u * v, v * v
@@ -308,8 +309,8 @@ def _view_sums(first, last, pivot, s, z, Z):
     """Sum ``w z_a z_c`` over a view's points, a of the pose: Z (6, COLUMNS)."""
     Z[:] = 0.0
     for i in range(first, last):
-        _by_pose(z[POSE:SURFACE], i, s, pivot)
-        _by_surface(z[SURFACE:ERROR], i, s)
+        by_pose(z[POSE:SURFACE], i, s, pivot)
+        by_surface(z[SURFACE:ERROR], i, s)
         z[ERROR] = s[OFF, i]
         w = s[COUNTS, i]
         for a in range(6):
@@ -319,7 +320,7 @@ def _view_sums(first, last, pivot, s, z, Z):
 
 
 @nb.njit(cache=True, nogil=True)
-def _turned(H, V, out):
+def into_map(H, V, out):
     """Columns of H (r, 6) from patch axes to map axes."""
     for r in range(H.shape[0]):
         for half in range(2):
@@ -341,40 +342,40 @@ def gather(
     What is left of the surfaces' own gradient is followed to first order. Blocks of A above the
     diagonal are left out.
     """
-    s, frames = _room(first, last, ends, views), len(g)
+    s, frames = room(first, last, ends, views), len(g)
     b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
     H, row = np.zeros((frames, 6, 6)), np.zeros((1, 6))
     turned, once = np.zeros((6, 6)), np.zeros((6, 6))
     for k in range(first, last):
         V = axes[k]
-        n = _place(k, points, weights, ends, views, Q, o, rays, s)
-        _meet(n, surface[k], rays, reach[k], s)
-        _weigh(n, square, s)
-        _surface_sums(n, s, M, b)
+        n = place(k, points, weights, ends, views, Q, o, rays, s)
+        meet(n, surface[k], rays, reach[k], s)
+        weigh(n, square, s)
+        surface_sums(n, s, M, b)
         for j in range(3, 6):
             b[j] -= stiff[k] * surface[k, j]
-        _firm(M, stiff[k], L)
-        _forward(L, b)
+        firm(M, stiff[k], L)
+        forward(L, b)
         begin = ends[views[k]]
         count = views[k + 1] - views[k]
         for x in range(count):
             m = views[k] + x
             f = frame[m]
             _view_sums(ends[m] - begin, ends[m + 1] - begin, pivot[m], s, z, Z)
-            _turned(Z[:, POSE:SURFACE], V, once)
-            _turned(once.T, V, turned)
+            into_map(Z[:, POSE:SURFACE], V, once)
+            into_map(once.T, V, turned)
             for a in range(6):
                 for c in range(6):
                     A[f, a, f, c] += turned[a, c]
             # rows of H: the pose in map axes; columns: the surface in units of its certainty
-            _turned(Z[:, SURFACE:ERROR].T, V, once)
-            _turned(Z[:, ERROR : ERROR + 1].T, V, row)
+            into_map(Z[:, SURFACE:ERROR].T, V, once)
+            into_map(Z[:, ERROR : ERROR + 1].T, V, row)
             for a in range(6):
                 h = H[x, a]
                 for j in range(6):
                     h[j] = once[j, a]
-                _forward(L, h)
+                forward(L, h)
                 told = row[0, a]
                 for j in range(6):
                     told -= h[j] * b[j]
@@ -399,33 +400,33 @@ def scores(
 
     ``groups`` (n, kinds) says which group a point is in.
     """
-    s, frames = _room(first, last, ends, views), out.shape[2]
+    s, frames = room(first, last, ends, views), out.shape[2]
     phi, J, b, M, L = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
     z, Z = np.zeros(COLUMNS), np.zeros((6, COLUMNS))
     H, once, row = np.zeros((frames, 6, 6)), np.zeros((6, 6)), np.zeros((1, 6))
     for k in range(first, last):
         V = axes[k]
-        n = _place(k, points, weights, ends, views, Q, o, rays, s)
-        _meet(n, surface[k], rays, reach[k], s)
-        _weigh(n, square, s)
-        _surface_sums(n, s, M, b)
-        _firm(M, stiff[k], L)
+        n = place(k, points, weights, ends, views, Q, o, rays, s)
+        meet(n, surface[k], rays, reach[k], s)
+        weigh(n, square, s)
+        surface_sums(n, s, M, b)
+        firm(M, stiff[k], L)
         begin = ends[views[k]]
         count = views[k + 1] - views[k]
         for x in range(count):
             m = views[k] + x
             _view_sums(ends[m] - begin, ends[m + 1] - begin, pivot[m], s, z, Z)
-            _turned(Z[:, SURFACE:ERROR].T, V, once)
+            into_map(Z[:, SURFACE:ERROR].T, V, once)
             for a in range(6):
                 for j in range(6):
                     H[x, a, j] = once[j, a]
-                _forward(L, H[x, a])
-                _backward(L, H[x, a])
+                forward(L, H[x, a])
+                backward(L, H[x, a])
         for m in range(views[k], views[k + 1]):
             for i in range(ends[m], ends[m + 1]):
-                _by_pose(J, i - begin, s, pivot[m])
-                _by_surface(phi, i - begin, s)
-                _turned(J.reshape(1, 6), V, row)
+                by_pose(J, i - begin, s, pivot[m])
+                by_surface(phi, i - begin, s)
+                into_map(J.reshape(1, 6), V, row)
                 wr = s[COUNTS, i - begin] * s[OFF, i - begin]
                 for kind in range(groups.shape[1]):
                     to = out[kind, groups[i, kind]]
@@ -446,12 +447,12 @@ def medians(ends, off, out):
     most = 0
     for k in range(len(out)):
         most = max(most, ends[k + 1] - ends[k])
-    room = np.empty(most)
+    space = np.empty(most)
     for k in range(len(out)):
         n = ends[k + 1] - ends[k]
         for i in range(n):
-            room[i] = abs(off[ends[k] + i])
-        part = room[:n]
+            space[i] = abs(off[ends[k] + i])
+        part = space[:n]
         part.sort()
         out[k] = part[n // 2]
 

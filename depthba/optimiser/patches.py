@@ -84,7 +84,7 @@ class Patches:
 
     def fitted(self, T_map_camera: Array, workers: Workers, rounds: int = NEAR) -> Fit:
         """Return the surfaces that fit best at poses (N, 4, 4), and what they cost."""
-        Q, o = self._local(T_map_camera)
+        Q, o = self.local(T_map_camera)
         surface, off = self.surface.copy(), np.empty(len(self.points))
 
         def of(share: tuple[int, int]) -> float:
@@ -125,8 +125,8 @@ class Patches:
         The surfaces, fitted at these poses or near them, are eliminated.
         """
         n = self.frames
-        Q, o = self._local(T_map_camera)
-        pivot = self._in_patches(pivots)
+        Q, o = self.local(T_map_camera)
+        pivot = self.in_patches(pivots)
 
         def of(share: tuple[int, int]) -> tuple[Array, Array]:
             A, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
@@ -152,10 +152,8 @@ class Patches:
         ``groups`` says for each frame, (kinds, points of the frame), which group a point is in.
         """
         n, kinds = self.frames, len(groups[0])
-        Q, o = self._local(T_map_camera)
-        pivot, mine = self._in_patches(pivots), np.empty((len(self.points), kinds), np.uint8)
-        for m, (first, last) in enumerate(pairwise(self.ends)):
-            mine[first:last] = groups[self.frame[m]][:, self.source[first:last]].T
+        Q, o = self.local(T_map_camera)
+        pivot, mine = self.in_patches(pivots), self.grouped(groups)
 
         def of(share: tuple[int, int]) -> Array:
             out = np.zeros((kinds, count, n, 6))
@@ -169,13 +167,20 @@ class Patches:
         total = sum(workers.map(of, self._shares()), start=np.zeros((kinds, count, n, 6)))
         return np.asarray(total.reshape(kinds, count, 6 * n))
 
-    def _local(self, T: Array) -> tuple[Array, Array]:
+    def grouped(self, groups: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """Return (n, kinds) the groups of the points; ``groups`` as in `scores`."""
+        mine = np.empty((len(self.points), len(groups[0])), np.uint8)
+        for m, (first, last) in enumerate(pairwise(self.ends)):
+            mine[first:last] = groups[self.frame[m]][:, self.source[first:last]].T
+        return mine
+
+    def local(self, T: Array) -> tuple[Array, Array]:
         """Return Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
         Q, o = np.empty((len(self.frame), 3, 3)), np.empty((len(self.frame), 3))
         patch_kernels.local(self.frame, self.views, self.axes, self.centre, T, Q, o)
         return Q, o
 
-    def _in_patches(self, pivots: Array) -> Array:
+    def in_patches(self, pivots: Array) -> Array:
         """Return (m, 3) the pivot of each view's frame in the axes of its patch."""
         patch = np.repeat(np.arange(len(self)), np.diff(self.views))
         away = pivots[self.frame] - self.centre[patch]
@@ -206,6 +211,12 @@ class Fit:
         patch_kernels.medians(patches.ends[patches.views], self.off, median)
         level = np.abs(patches.axes[:, 2, 0]) > LEVEL
         return patches.only((median <= most) & ~level)
+
+    def counted(self, times: float) -> Fit:
+        """Return the same, with all that the patches say said so many times."""
+        root, p = float(np.sqrt(times)), self.patches
+        patches = replace(p, weights=times * p.weights, stiff=times * p.stiff, scale=root * p.scale)
+        return Fit(patches, times * self.cost, root * self.off)
 
     def rescaled(self, sigma: float) -> Fit:
         """Return the patches with the loss that their residuals call for; it never widens.

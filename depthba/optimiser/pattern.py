@@ -22,6 +22,7 @@ from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Feet, Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
+from depthba.optimiser.patch_waves import Told
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.reduced import Reduction
 from depthba.optimiser.stencil import MapSolver
@@ -82,6 +83,15 @@ class Answers:
     """(m,)."""
     map: NDArray[np.float32]
     """(ny, nx, m), by how much the map falls with a unit of each wave."""
+    surfaces: Array | None = None
+    """(k, 6, m), by how much patches beside the map move with a unit of each; None: none are."""
+
+    def beside(self, told: Told) -> Answers:
+        """Return the same with what patches say."""
+        return Answers(
+            self.own + told.own, self.cross + told.cross, self.gradient + told.gradient, self.map,
+            told.surfaces,
+        )  # fmt: skip
 
 
 def share_of(frame: FramePoints, feet: Feet, weights: NDArray[np.float32], waves: Waves) -> Share:

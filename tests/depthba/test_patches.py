@@ -7,16 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from depthba import se3
 from depthba.optimiser import tying
 from depthba.optimiser.laying import Cloud, lay
 from depthba.optimiser.patches import Patches
 from depthba.optimiser.prior import move
 from depthba.optimiser.tying import FAR, patches_beside
 from depthba.optimiser.workers import Workers
+from tests.depthba.balls import N, balls, poses
 from tests.depthba.optimiser_problems import problem_of
-
-N = 4
 
 
 @pytest.fixture(scope="module")
@@ -24,36 +22,6 @@ def workers():
     made = Workers(2)
     yield made
     made.close()
-
-
-def poses(rng, t=0.0, r=0.0):
-    """Sensors about 1 m above the scene, off by Gaussian errors; frame 0 is exact."""
-    T = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])[None].repeat(N, axis=0)
-    T[:, :2, 3] = [[-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]]
-    error = np.concatenate([rng.normal(0, t, (N, 3)), rng.normal(0, r, (N, 3))], axis=1)
-    error[0] = 0.0
-    return move(T, T[:, :3, 3], error)
-
-
-def balls(rng, T, sigma, points=2500, flat=0.0):
-    """Noisy points on half balls that stand close together, as each frame sees them.
-
-    The larger `flat`, the less of a ball.
-    """
-    centres = np.stack([*np.meshgrid([-0.12, 0.0, 0.12], [-0.12, 0.0, 0.12]), np.zeros((3, 3))], -1)
-    clouds = []
-    for pose in T:
-        k = rng.integers(0, 9, points)
-        d = rng.normal(size=(points, 3))
-        d[:, 2] = np.abs(d[:, 2]) + flat
-        x = centres.reshape(-1, 3)[k] + 0.05 * d / np.linalg.norm(d, axis=1)[:, None]
-        p = (x - pose[:3, 3]) @ pose[:3, :3]
-        way = np.linalg.norm(p, axis=1)
-        clouds.append(p * (1 + sigma * rng.normal(size=points) / way)[:, None])
-    frame = np.repeat(np.arange(N), points)
-    return Cloud(
-        np.concatenate(clouds), np.ones(N * points), frame, np.tile(np.arange(points), N), True
-    )
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +79,20 @@ def test_all_frames_moved_as_one_cost_the_same(laid, workers):
     own = sum(np.abs(A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]) for i in range(N))
     assert (shared[:2, :2] < 0.2 * own[:2, :2].max()).all()
     assert np.linalg.eigvalsh(A)[0] > -1e-9 * np.linalg.eigvalsh(A)[-1]
+
+
+def test_patches_that_count_three_times_say_so_three_times(laid, workers):
+    T, patches = laid
+    fit = settled(patches, T, workers)
+    more = fit.counted(3.0)
+    assert more.patches.fitted(T, workers).cost == pytest.approx(3 * fit.cost, rel=1e-6)
+    assert more.cost == pytest.approx(3 * fit.cost)
+    for once, thrice in zip(
+        fit.patches.normal_equations(T, T[:, :3, 3], workers),
+        more.patches.normal_equations(T, T[:, :3, 3], workers),
+        strict=True,
+    ):
+        np.testing.assert_allclose(thrice, 3 * once, atol=1e-6 * np.abs(once).max())
 
 
 def test_groups_of_points_add_up_to_the_gradient(laid, workers):
