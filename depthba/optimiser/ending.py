@@ -6,7 +6,7 @@ or a finer map is allowed; and the camera may have a fixed pattern to be taken o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,44 +109,72 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
 
     Returns where that ends, and what is known there if it was found out.
     """
-    before: _Before | None = None
-    trail, emphasis = Trail(), 0
+    course = _Course()
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
-        if before is not None and there.inflation > before.share * before.inflation:
-            engine.problem, engine.bend, engine.plain = before.problem, None, True
-            engine.refused_pattern, end, before = before.size, before.end, None
+        if course.refuted(there):
+            end = course.back(engine)
             there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
-            emphasis, engine.emphasis = 0, EMPHASIS[0]
+        further = course.further(engine, end, there)
+        if further is None:
+            return end, there
+        # of many points, what was known there takes memory that finding out anew needs
+        end = further
+        del there
+    return end, None
+
+
+@dataclass
+class _Course:
+    """What going on has come by."""
+
+    before: _Before | None = None
+    trail: Trail = field(default_factory=Trail)
+    emphasis: int = 0
+
+    def refuted(self, there: Known) -> bool:
+        """Whether the pattern that has been taken off leaves residuals too much alike."""
+        before = self.before
+        return before is not None and there.inflation > before.share * before.inflation
+
+    def back(self, engine: Engine) -> End:
+        """Put all points back to where they were measured; return where that was."""
+        before, self.before, self.emphasis = self.before, None, 0
+        assert before is not None
+        engine.problem, engine.bend, engine.plain = before.problem, None, True
+        engine.refused_pattern, engine.emphasis = before.size, EMPHASIS[0]
+        return before.end
+
+    def further(self, engine: Engine, end: End, there: Known) -> End | None:
+        """Settle anew as what is known asks for; None: it asks for nothing."""
         known, outcome, level = there.correlation, end.outcome, end.level
         finer = engine.finer(level.grid.spacing, known, outcome)
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
         # a pattern may be what keeps the poses from settling
         alike = level.tied is not None and known.overall > ALIKE
-        firmer = alike and emphasis < len(EMPHASIS) - 1
+        firmer = alike and self.emphasis < len(EMPHASIS) - 1
         more = firmer or bent or (outcome.converged and (less or finer < level.grid.spacing))
         if engine.clock.over or not more:
-            return end, there
+            return None
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
         new = firmer or bent or finer < level.grid.spacing or engine.doubted
         tied = None if new else outcome.tied
         if bent and there.believed is not None:
-            taken = trail.next(engine.bend, there.believed.pattern)
-            before = _on_trial(engine, before, end, there, taken)
+            taken = self.trail.next(engine.bend, there.believed.pattern)
+            self.before = _on_trial(engine, self.before, end, there, taken)
             level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
         if firmer:
-            emphasis += 1
-            engine.emphasis = EMPHASIS[emphasis]
+            self.emphasis += 1
+            engine.emphasis = EMPHASIS[self.emphasis]
         if finer < level.grid.spacing:
             index += 1
             coarse = Map(state.heights, level.grid)
             level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
-        end = engine.settle(level, state, lin, index, known, tied)
-    return end, None
+        return engine.settle(level, state, lin, index, known, tied)
 
 
 def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:

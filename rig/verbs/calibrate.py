@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from depthba.dataset import Dataset
-    from rig.hand_eye.depth.descent import Iteration
+    from depthba.result import Iteration
     from rig.hand_eye.record import HandEyeRecord
 
 
@@ -209,10 +209,8 @@ def _start(dataset: Dataset, path: Path | None) -> NDArray[np.float64]:
 
 
 def _show(bar: Bar, iteration: Iteration) -> None:
-    import numpy as np
-
-    t, r = (float(np.linalg.norm(iteration.step[k])) for k in (slice(3), slice(3, 6)))
-    step = f"step {length(t)}, {angle(r)}" if iteration.accepted else "step refused"
+    moved = f"step {length(iteration.step_t)}, {angle(iteration.step_r)}"
+    step = moved if iteration.accepted else "step refused"
     bar.show(
         f"map of {length(iteration.spacing)}: cost {iteration.cost:.6g}, {step}, "
         f"sigma {length(iteration.sigma)}",

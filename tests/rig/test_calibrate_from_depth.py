@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,23 @@ def test_parallel_axes_leave_the_shift_along_them(tmp_path: Path) -> None:
     assert [o.name for o in result.open] == ["z"]
     error = se3.difference(result.T_flange_camera, X)
     assert np.linalg.norm(error[:2]) < 1e-3
+
+
+@pytest.mark.parametrize("fault", ["a centimetre off", "one frame late"])
+def test_flange_poses_of_something_else_are_named(tmp_path: Path, fault: str) -> None:
+    arm = write_arm(tmp_path / "arm", frames=8)
+    flange = np.stack([frame.T_base_flange for frame in arm])
+    if fault == "one frame late":
+        flange = np.roll(flange, -1, axis=0)
+    else:
+        rng = np.random.default_rng(0)
+        flange = se3.retract(flange, 0.01 * rng.standard_normal((8, 6)))
+    frames = zip(arm.frames, flange, strict=True)
+    result = found(replace(arm, frames=tuple(replace(f, T_base_flange=T) for f, T in frames)))
+    assert result.status == "inconsistent"
+    assert "do not fit the frames" in result.reason
+    if fault != "one frame late":
+        assert result.beliefs.robot_t == pytest.approx(0.01, rel=0.3)
 
 
 def test_refuses_values_that_make_no_sense(arm: Dataset) -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from depthba import se3
 from depthba.kinematics import UR16E
-from depthba.optimiser.prior import move
 from rig.hand_eye.depth.believed import Beliefs, estimate, posterior
-from rig.hand_eye.depth.chain import Chain, without_gauge
+from rig.hand_eye.depth.chain import Chain
+from rig.hand_eye.depth.fit import Seen, Start, fit, put_first, relative
 from rig.hand_eye.depth.verdict import open_directions
 from rig.hand_eye.flanges import motion_fault, turned
 from tests.rig.arm_scene import X, flanges
@@ -21,7 +23,7 @@ def chain(seed: int = 0) -> Chain:
     rng = np.random.default_rng(seed)
     q = rng.uniform(-1.5, 1.5, (N, 6))
     return Chain(
-        T_map_base=se3.make(se3.exp_so3([0.3, -0.2, 1.0]), [0.5, 0.2, -0.1]),
+        T_world_base=se3.make(se3.exp_so3([0.3, -0.2, 1.0]), [0.5, 0.2, -0.1]),
         T_base_flange=UR16E.forward(q),
         T_flange_camera=X,
         missed=np.zeros((N, 6)),
@@ -32,13 +34,12 @@ def chain(seed: int = 0) -> Chain:
 
 def test_jacobian_equals_finite_differences() -> None:
     one = chain()
-    pivots = np.random.default_rng(1).uniform(-1, 1, (N, 3))
-    J = one.jacobian(pivots)
+    J = one.jacobian()
     h = 1e-6
     for k in range(J.shape[1]):
         step = h * np.eye(J.shape[1])[k]
-        moved = one.moved(step).T_map_camera
-        predicted = move(one.T_map_camera, pivots, (J @ step).reshape(N, 6))
+        moved = one.moved(step).T_world_camera
+        predicted = se3.retract(one.T_world_camera, (J @ step).reshape(N, 6))
         assert np.abs(se3.difference(moved, predicted)).max() < 1e-4 * h
 
 
@@ -51,15 +52,44 @@ def test_zeros_move_the_flange_as_the_arm_does() -> None:
     assert np.abs(difference).max() < 1e-8
 
 
-def test_what_moves_all_cameras_alike_is_taken_off_and_nothing_else() -> None:
-    rng = np.random.default_rng(0)
-    pivots, motion = rng.uniform(-1, 1, (N, 3)), rng.standard_normal(6)
-    alike = np.hstack([motion[:3] + np.cross(motion[3:], pivots), np.tile(motion[3:], (N, 1))])
-    other = rng.standard_normal((6 * N, 2))
-    assert np.abs(without_gauge(alike.reshape(-1, 1), pivots)).max() < 1e-12
-    once = without_gauge(other, pivots)
-    np.testing.assert_allclose(without_gauge(once + alike.reshape(-1, 1), pivots), once, atol=1e-12)
-    assert np.linalg.matrix_rank(np.hstack([other - once, alike.reshape(-1, 1)])) <= 3
+def seen_from(one: Chain, rng: np.random.Generator, sigma: float) -> Seen:
+    """Poses as a registration has them, relative to the first, which lies elsewhere."""
+    root = rng.standard_normal((6 * N - 6, 6 * N - 6))
+    covariance = sigma**2 * (root @ root.T / (6 * N) + 0.1 * np.eye(6 * N - 6))
+    off = np.concatenate([np.zeros(6), rng.multivariate_normal(np.zeros(6 * N - 6), covariance)])
+    T = se3.retract(one.T_world_camera, off.reshape(N, 6))
+    world = se3.make(se3.exp_so3([0.1, 0.4, -0.3]), [1.0, 2.0, -3.0])
+    turn = np.kron(np.eye(2 * N - 2), world[:3, :3])
+    return Seen(world @ T, np.arange(1, N), np.linalg.inv(turn @ covariance @ turn.T))
+
+
+def test_what_is_off_relative_to_the_first_against_finite_differences() -> None:
+    rng = np.random.default_rng(4)
+    seen = seen_from(chain(), rng, 1e-3)
+    one = put_first(chain(), seen.T_world_camera[0])
+    e, J = relative(one, seen)
+    h = 1e-6
+    for k in range(J.shape[1]):
+        moved = put_first(one.moved(h * np.eye(J.shape[1])[k]), seen.T_world_camera[0])
+        found = (relative(moved, seen)[0] - e) / h
+        np.testing.assert_allclose(found, J[:, k], atol=2e-3)
+
+
+def test_the_fit_finds_x_and_its_covariance_covers_the_error() -> None:
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        true = chain()
+        missed = rng.standard_normal((N, 6)) * np.repeat([5e-5, 1e-4], 3)
+        seen = seen_from(replace(true, missed=missed), rng, 1e-4)
+        start = Start(se3.retract(X, 1e-2 * rng.standard_normal(6)), np.full(6, 1e-2))
+        begun = replace(true, T_flange_camera=start.T_flange_camera)
+        found = fit(begun, seen, start, Beliefs(start.sigma, 5e-4, 5e-5, 1e-4))
+        assert found.converged
+        error = se3.difference(found.chain.T_flange_camera, X)
+        squares.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6)
+        assert np.abs(error).max() < 2e-3
+    assert 0.2 < np.mean(squares) < 1.6
 
 
 def test_posterior_weighs_data_and_beliefs() -> None:
@@ -79,8 +109,8 @@ def test_a_robot_worse_than_stated_is_found_out() -> None:
     missed = rng.standard_normal((frames, 6)) * np.repeat([1e-3, 2e-3], 3)
     H = np.diag(np.concatenate([np.ones(6), np.full(6 * frames, 1e12)]))
     g = -H @ np.concatenate([np.zeros(6), missed.ravel()])
-    stated = Beliefs(np.full(6, 0.01), 1e-4, 5e-5, 1e-4, 0.0)
-    beliefs, step, _ = estimate(H, g, np.zeros(len(g)), stated, 0, frames, 0)
+    stated = Beliefs(np.full(6, 0.01), 1e-4, 5e-5, 1e-4)
+    beliefs, step, _ = estimate(H, g, np.zeros(len(g)), stated, 0, frames)
     assert beliefs.robot_t == pytest.approx(1e-3, rel=0.15)
     assert beliefs.robot_r == pytest.approx(2e-3, rel=0.15)
     np.testing.assert_allclose(step[6:], missed.ravel(), atol=1e-5)

@@ -1,7 +1,7 @@
 """What is believed of each unknown beside the depth, and how strong each kind of error is.
 
-The unknowns are X, the joints' zeros, the flanges and the camera's fixed pattern, in this order.
-How much the last three scatter is estimated along with them (expectation maximisation for variance
+The unknowns are X, the joints' zeros and the flanges, in this order. How much the last two scatter
+is estimated along with them (expectation maximisation for variance
 components, Dempster, Laird & Rubin 1977), since a robot is rarely as good as its data sheet says.
 """
 
@@ -31,10 +31,8 @@ class Beliefs:
     """Of a flange's place, along each axis, m."""
     robot_r: float
     """Of a flange's orientation, about each axis, rad."""
-    pattern: float
-    """Of each wave of the fixed pattern, m at a point of weight 1; 0: there is none."""
 
-    def variances(self, zeros: int, frames: int, waves: int) -> Array:
+    def variances(self, zeros: int, frames: int) -> Array:
         """Return the variance of each unknown."""
         flange = np.repeat([self.robot_t, self.robot_r], 3) ** 2
         return np.concatenate(
@@ -42,13 +40,12 @@ class Beliefs:
                 self.start**2,
                 np.full(zeros, self.zero**2),
                 np.tile(flange, frames),
-                np.full(waves, max(self.pattern, 1e-9) ** 2),
             ]
         )
 
 
 def estimate(
-    H: Array, g: Array, now: Array, stated: Beliefs, zeros: int, frames: int, waves: int
+    H: Array, g: Array, now: Array, stated: Beliefs, zeros: int, frames: int
 ) -> tuple[Beliefs, Array, Array]:
     """Find how strong each kind of error is, and where that puts the unknowns.
 
@@ -59,16 +56,15 @@ def estimate(
         stated: the robot's errors are not taken to be smaller than here.
         zeros: number of joints.
         frames: number of frames.
-        waves: number of waves of the pattern.
 
     Returns:
         The beliefs, the step (k,) and the posterior covariance (k, k).
     """
     beliefs = stated
     flange = 6 + zeros + np.arange(6 * frames).reshape(frames, 6)
-    joint, wave = slice(6, 6 + zeros), slice(6 + zeros + 6 * frames, None)
+    joint = slice(6, 6 + zeros)
     for _ in range(ROUNDS):
-        step, covariance = posterior(H, g, now, beliefs.variances(zeros, frames, waves))
+        step, covariance = posterior(H, g, now, beliefs.variances(zeros, frames))
         moment = (now + step) ** 2 + np.diag(covariance)
         zero = (STATED * stated.zero**2 + moment[joint].sum()) / (STATED + zeros)
         beliefs = replace(
@@ -76,9 +72,8 @@ def estimate(
             zero=float(np.sqrt(zero)),
             robot_t=max(stated.robot_t, float(np.sqrt(moment[flange[:, :3]].mean()))),
             robot_r=max(stated.robot_r, float(np.sqrt(moment[flange[:, 3:]].mean()))),
-            pattern=float(np.sqrt(moment[wave].mean())) if waves else 0.0,
         )
-    step, covariance = posterior(H, g, now, beliefs.variances(zeros, frames, waves))
+    step, covariance = posterior(H, g, now, beliefs.variances(zeros, frames))
     return beliefs, step, covariance
 
 
@@ -92,17 +87,3 @@ def posterior(H: Array, g: Array, now: Array, variance: Array) -> tuple[Array, A
     covariance = scale[:, None] * inner * scale
     step = -covariance @ (g + now / variance)
     return step, (covariance + covariance.T) / 2
-
-
-def newton_step(derivative: Array, g: Array, now: Array, variance: Array) -> Array:
-    """Return the step (k,) to where the gradient g and the beliefs balance.
-
-    Args:
-        derivative: (k, k) of g by the unknowns; it need not be symmetric.
-        g: (k,), at the present values.
-        now: (k,) the present values.
-        variance: (k,) of the beliefs about 0.
-    """
-    scale = np.sqrt(variance)
-    inner = np.eye(len(now)) + scale[:, None] * derivative * scale
-    return np.asarray(-scale * np.linalg.solve(inner, scale * (g + now / variance)))

@@ -1,12 +1,12 @@
 """Hand-eye calibration without a board: X from depth and flange poses alone.
 
-The map is solved with it, coarse to fine as in registration; then everything else that errs joins
-in: the robot, and the camera's fixed pattern.
+The frames are registered twice. At first the arm holds them: what all poses share, an error of X,
+is as uncertain as the start, and the rest is as good as the arm. From there the depths alone say
+where they were, and X and all that the robot gets wrong are fitted to that.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,20 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba import se3
 from depthba.dataset import Dataset
+from depthba.dataset.sensor import HandEyeNoise, PoseNoise
 from depthba.errors import OptionError
-from depthba.optimiser import schedule
-from depthba.optimiser.bends import without_bends
-from depthba.optimiser.level import level_heights, make_level
-from depthba.optimiser.workers import Workers
+from depthba.optimiser.register import register
 from depthba.options import Options as MapOptions
+from depthba.result import Iteration, Result
 from rig.hand_eye.depth.believed import Beliefs
-from rig.hand_eye.depth.descent import Iteration, Start, descend
-from rig.hand_eye.depth.joint import Joint, solve
-from rig.hand_eye.depth.pattern import waves_of
-from rig.hand_eye.depth.problem import set_up
+from rig.hand_eye.depth.chain import Chain
+from rig.hand_eye.depth.fit import Seen, Start, fit
 from rig.hand_eye.depth.verdict import Status, judge
-from rig.hand_eye.flanges import turned
+from rig.hand_eye.flanges import flange_poses, joint_motions, turned
 from rig.hand_eye.record import Open
 
 Array = NDArray[np.float64]
@@ -38,8 +36,12 @@ LIMIT = 40
 # Change of slope of the map beyond which points take no part in the end: where more is kept the
 # depths contradict the truth, where less is kept they leave the robot's own errors undecided.
 SHARP = 2.0
-# Of a joint's zero, rad, and of each wave of the fixed pattern, m, to begin with.
-ZERO, PATTERN = 0.0005, 0.0001
+# Standard deviation of a joint's zero, rad, to begin with.
+ZERO = 0.0005
+# No arm whose joints are not known is taken to be better than this, m and rad.
+ARM_T, ARM_R = 0.0003, 0.0005
+# How far off the frames may be that the arm has held, m and rad: it says how coarse to begin.
+NEAR_T, NEAR_R = 0.001, 0.001
 
 
 @dataclass(frozen=True)
@@ -80,19 +82,12 @@ class HandEye:
     missed: Array
     """(N, 6), by which each flange is thought to be elsewhere than reported, base axes, m and
     rad."""
-    residuals: Array
-    """(N,) robust standard deviation of each frame's residuals, m."""
     zeros: Array
     """(n,), by which the joints' zeros are thought to be off, rad."""
     beliefs: Beliefs
     """How much each kind of error is thought to scatter."""
-    inflation: float
-    """Factor by which the residuals' correlation inflates their variance."""
-    sigma: float
-    """Robust standard deviation of the residuals, m."""
-    spacing: float
-    """Finest map spacing, m."""
-    iterations: int
+    registration: Result
+    """Of the frames, on which it rests."""
     seconds: float
 
     @property
@@ -143,23 +138,18 @@ def calibrate(
     options = options or Options()
     check(options)
     begin = time.perf_counter()
-    workers = Workers(options.threads or os.cpu_count() or 1)
-    count = 0
-
-    def report(iteration: Iteration) -> None:
-        nonlocal count
-        count += 1
-        if callback is not None:
-            callback(iteration)
-
-    try:
-        joint, spacing, start = _estimate(dataset, T_flange_camera, options, report, workers)
-    finally:
-        workers.close()
-    chain = joint.chain
-    covariance = joint.covariance[:6, :6]
-    status, reason, left_open = judge(chain, covariance, start, joint.beliefs, joint.converged)
-    missed = chain.missed + (chain.joints @ chain.zeros).reshape(-1, 6)
+    chain = set_up(dataset, T_flange_camera)
+    start_t, start_r = options.start_error[0], float(np.radians(options.start_error[1]))
+    start = Start(T_flange_camera, np.repeat([start_t, start_r], 3))
+    noise = options.robot_noise
+    stated = Beliefs(start.sigma, ZERO, noise[0], float(np.radians(noise[1])))
+    result = seen(dataset, chain, stated, options, callback)
+    found = fit(chain, Seen.of(result), start, stated)
+    chain, covariance = found.chain, found.covariance[:6, :6]
+    ended = "" if found.converged else "the iterations ended before the transform settled"
+    if result.status in ("not_converged", "no_better"):
+        ended = f"the frames did not come together: {result.reason}"
+    status, reason, left_open = judge(chain, covariance, start, found.beliefs, ended)
     return HandEye(
         status=status,
         reason=reason,
@@ -168,44 +158,68 @@ def calibrate(
         covariance=covariance,
         open=left_open,
         turned=turned(chain.T_base_flange)[0],
-        missed=missed,
-        residuals=joint.residuals,
+        missed=chain.missed + (chain.joints @ chain.zeros).reshape(-1, 6),
         zeros=chain.zeros,
-        beliefs=joint.beliefs,
-        inflation=joint.inflation,
-        sigma=joint.sigma,
-        spacing=spacing,
-        iterations=count,
+        beliefs=found.beliefs,
+        registration=result,
         seconds=time.perf_counter() - begin,
     )
 
 
-def _estimate(
+def seen(
     dataset: Dataset,
-    T_flange_camera: Array,
+    chain: Chain,
+    stated: Beliefs,
     options: Options,
-    report: Callable[[Iteration], None],
-    workers: Workers,
-) -> tuple[Joint, float, Start]:
-    """Go through the levels, then let everything that errs join in; return the finest spacing."""
-    sigma = np.repeat([options.start_error[0], np.radians(options.start_error[1])], 3)
-    map_options = MapOptions(resolution=options.resolution, threads=options.threads)
-    preset = schedule.PRESETS["default"]
-    problem, chain = set_up(dataset, T_flange_camera, sigma)
-    start = Start(T_flange_camera, sigma)
-    levels = schedule.spacings(map_options, problem, sigma[:3], sigma[3:])
-    heights, previous = None, None
-    for index, spacing in enumerate(levels):
-        last = index == len(levels) - 1
-        level = make_level(problem, chain.T_map_camera, spacing, preset, map_options, last)
-        heights = level_heights(level, heights, previous)
-        for robust in (WIDE, preset.robust) if index == 0 else (preset.robust,):
-            descent = descend(level, chain, heights, start, robust, LIMIT, workers, report)
-            chain, heights = descent.chain, descent.heights
-        previous = level.grid
-    steady = without_bends(level.problem, level.grid, descent.heights, chain.T_map_camera, SHARP)
-    level = replace(level, problem=steady)
-    waves = waves_of(level.problem)
-    noise = options.robot_noise
-    stated = Beliefs(sigma, ZERO, noise[0], float(np.radians(noise[1])), PATTERN)
-    return solve(level, descent, waves, start, stated, workers, report), levels[-1], start
+    callback: Callable[[Iteration], None] | None,
+) -> Result:
+    """Register the frames from where the chain has them, in the end by the depths alone."""
+    t, r = arm_sigmas(chain, stated)
+    shared = HandEyeNoise(_three(stated.start[0]), _three(stated.start[3]))
+    held = replace(
+        placed(dataset, chain.T_world_camera),
+        pose_noise=PoseNoise(_three(t), _three(r), shared),
+    )
+    common = MapOptions(resolution=options.resolution, threads=options.threads)
+    first = register(held, common, callback)
+    alone = replace(common, priors=False, prior_t=NEAR_T, prior_r=NEAR_R)
+    return register(placed(dataset, first.T_world_camera), alone, callback)
+
+
+def placed(dataset: Dataset, T_world_camera: Array) -> Dataset:
+    """Return the dataset with measured poses (N, 4, 4) in place of its own."""
+    frames = zip(dataset.frames, T_world_camera, strict=True)
+    return replace(dataset, frames=tuple(replace(f, T_world_camera=T) for f, T in frames))
+
+
+def arm_sigmas(chain: Chain, stated: Beliefs) -> tuple[float, float]:
+    """Return how far off a flange may be along and about each axis, m and rad (rms)."""
+    off = np.square(chain.joints * stated.zero).sum(axis=1).reshape(-1, 2, 3)
+    t, r = np.sqrt(off.mean(axis=(0, 2)) + np.square([stated.robot_t, stated.robot_r]))
+    return max(float(t), ARM_T), max(float(r), ARM_R)
+
+
+def _three(value: float) -> tuple[float, float, float]:
+    return (float(value),) * 3
+
+
+def set_up(dataset: Dataset, T_flange_camera: Array) -> Chain:
+    """Hang the cameras on the flanges.
+
+    The base stands in the world as the measured poses say; that fixes the gauge and nothing else.
+
+    Args:
+        dataset: with flange poses.
+        T_flange_camera: (4, 4), the start.
+    """
+    T_base_flange = flange_poses(dataset)
+    behind = T_flange_camera if dataset.T_flange_camera is None else dataset.T_flange_camera
+    joints = joint_motions(dataset, T_base_flange)
+    return Chain(
+        T_world_base=dataset[0].T_world_camera @ se3.inverse(T_base_flange[0] @ behind),
+        T_base_flange=T_base_flange,
+        T_flange_camera=T_flange_camera,
+        missed=np.zeros((len(T_base_flange), 6)),
+        joints=joints,
+        zeros=np.zeros(joints.shape[1]),
+    )

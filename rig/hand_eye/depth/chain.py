@@ -1,4 +1,4 @@
-"""The chain from the map to the camera, ``T_map_camera(i) = T_map_base T_base_flange(i) X``.
+"""The chain from the world to the camera, ``T_world_camera(i) = T_world_base T_base_flange(i) X``.
 
 Perturbations of ``X = T_flange_camera`` and of the flange poses are as in `depthba.se3.retract`:
 translation then rotation, the former about the camera centre along the flange's axes, the latter
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from depthba import se3
-from depthba.optimiser.prior import about_pivot
 
 Array = NDArray[np.float64]
 
@@ -24,8 +23,8 @@ Array = NDArray[np.float64]
 class Chain:
     """Where every camera is, by the robot and the hand-eye transform."""
 
-    T_map_base: Array
-    """(4, 4), fixed: the gauge."""
+    T_world_base: Array
+    """(4, 4): the gauge, of which depths say nothing."""
     T_base_flange: Array
     """(N, 4, 4), as the robot reports them."""
     T_flange_camera: Array
@@ -45,14 +44,14 @@ class Chain:
         return se3.retract(self.T_base_flange, off)
 
     @property
-    def T_map_flange(self) -> Array:
+    def T_world_flange(self) -> Array:
         """(N, 4, 4), corrected."""
-        return np.asarray(self.T_map_base @ self.T_base_flange_corrected)
+        return np.asarray(self.T_world_base @ self.T_base_flange_corrected)
 
     @property
-    def T_map_camera(self) -> Array:
+    def T_world_camera(self) -> Array:
         """(N, 4, 4), corrected."""
-        return np.asarray(self.T_map_flange @ self.T_flange_camera)
+        return np.asarray(self.T_world_flange @ self.T_flange_camera)
 
     def moved(self, step: NDArray[np.floating[Any]]) -> Chain:
         """Return the chain after a step of X (6,), or of X, the zeros and the flanges.
@@ -66,58 +65,34 @@ class Chain:
         missed = self.missed + step[6 + n :].reshape(-1, 6)
         return replace(chain, zeros=self.zeros + step[6 : 6 + n], missed=missed)
 
-    def jacobian(self, pivots: Array) -> Array:
-        """Return (6N, 6 + n + 6N): what `moved` takes, as perturbations about the pivots."""
-        robot = self.by_robot(pivots)
-        return np.hstack([self.by_hand_eye(pivots), robot @ self.joints, robot])
+    def jacobian(self) -> Array:
+        """Return (6N, 6 + n + 6N): what `moved` takes, as perturbations of the cameras.
 
-    def by_hand_eye(self, pivots: Array) -> Array:
-        """Return (6N, 6): a perturbation of X as perturbations of all cameras about the pivots.
-
-        With ``G = T_map_flange``, ``R_G Exp(phi) R_X = Exp(R_G phi) R_G R_X`` and
-        ``R_G (t_X + tau) + t_G``: about the camera centre both parts only turn into map axes.
+        Those are as `depthba.se3.retract` has them: about the camera centres, world axes.
         """
-        T_map_flange = self.T_map_flange
-        turn = np.zeros((len(T_map_flange), 6, 6))
-        turn[:, :3, :3] = turn[:, 3:, 3:] = T_map_flange[:, :3, :3]
-        return self._about(pivots, turn).reshape(-1, 6)
+        robot = self.by_robot()
+        return np.hstack([self.by_hand_eye(), robot @ self.joints, robot])
 
-    def by_robot(self, pivots: Array) -> Array:
+    def by_hand_eye(self) -> Array:
+        """Return (6N, 6): a perturbation of X as perturbations of all cameras.
+
+        With ``G = T_world_flange``, ``R_G Exp(phi) R_X = Exp(R_G phi) R_G R_X`` and
+        ``R_G (t_X + tau) + t_G``: both parts only turn into world axes.
+        """
+        T_world_flange = self.T_world_flange
+        turn = np.zeros((len(T_world_flange), 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = T_world_flange[:, :3, :3]
+        return turn.reshape(-1, 6)
+
+    def by_robot(self) -> Array:
         """Return (6N, 6N), block-diagonal: the same for a perturbation of each flange.
 
         A turn of the flange swings the camera about it.
         """
-        R_map_base = self.T_map_base[:3, :3]
+        R_world_base = self.T_world_base[:3, :3]
         flange = self.T_base_flange_corrected
         swing = -se3.hat(flange[:, :3, :3] @ self.T_flange_camera[:3, 3])
         turn = np.zeros((len(flange), 6, 6))
-        turn[:, :3, :3] = turn[:, 3:, 3:] = R_map_base
-        turn[:, :3, 3:] = R_map_base @ swing
-        return np.asarray(block_diag(*self._about(pivots, turn)))
-
-    def _about(self, pivots: Array, centre: Array) -> Array:
-        """Take perturbations about the camera centres (N, 6, 6) to ones about the pivots."""
-        return np.asarray(np.linalg.solve(about_pivot(self.T_map_camera, pivots), centre))
-
-
-def without_gauge(columns: Array, pivots: Array) -> Array:
-    """Return perturbations of all cameras less what moves everything alike.
-
-    A motion of all cameras together moves the map and nothing else, so depths say nothing about
-    it. On a grid that stands still they seem to say a little, which would pass for knowledge where
-    the motions leave X open.
-
-    Args:
-        columns: (6N, k), perturbations about the pivots.
-        pivots: (N, 3), map frame, m.
-    """
-    arm = pivots - pivots.mean(axis=0)
-    lever = max(float(np.sqrt(np.square(arm).sum(axis=1).mean())), 1e-3)
-    alike = np.zeros((len(pivots), 6, 6))
-    alike[:, :3, :3] = np.eye(3)
-    alike[:, :3, 3:] = -se3.hat(arm) / lever
-    alike[:, 3:, 3:] = np.eye(3) / lever
-    scale = np.tile(np.repeat([1.0, lever], 3), len(pivots))[:, None]
-    basis = np.linalg.qr(scale * alike.reshape(-1, 6))[0]
-    scaled = scale * columns
-    return np.asarray((scaled - basis @ (basis.T @ scaled)) / scale)
+        turn[:, :3, :3] = turn[:, 3:, 3:] = R_world_base
+        turn[:, :3, 3:] = R_world_base @ swing
+        return np.asarray(block_diag(*turn))

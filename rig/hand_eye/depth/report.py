@@ -32,6 +32,7 @@ def record_of(result: HandEye) -> HandEyeRecord:
 def content(result: HandEye, dataset: Dataset) -> dict[str, Any]:
     """Return what hand_eye.json holds: m and rad but for what is named otherwise."""
     moved = se3.difference(result.T_flange_camera, result.T_flange_camera_start)
+    seen = result.registration
     return {
         **head(record_of(result), dataset),
         "T_flange_camera_start": result.T_flange_camera_start.tolist(),
@@ -43,22 +44,21 @@ def content(result: HandEye, dataset: Dataset) -> dict[str, Any]:
             "sigma_deg": float(np.degrees(result.beliefs.robot_r)),
             "joint_zeros_deg": np.degrees(result.zeros).tolist(),
         },
-        "pattern_mm": 1e3 * result.beliefs.pattern,
-        "inflation": result.inflation,
-        "sigma_m": result.sigma,
-        "spacing_m": result.spacing,
+        "registration": {"status": seen.status, "reason": seen.reason},
+        "pattern_mm": 1e3 * seen.fixed_pattern,
+        "inflation": seen.inflation,
+        "sigma_m": seen.sigma,
+        "spacing_m": seen.depth_map.spacing,
         "frames": [
             {
                 "frame": frame.id,
-                "residual_mm": float(1e3 * residual),
+                "inliers": report.inliers,
                 "flange_mm": (1e3 * missed[:3]).tolist(),
                 "flange_deg": np.degrees(missed[3:]).tolist(),
             }
-            for frame, residual, missed in zip(
-                dataset, result.residuals, result.missed, strict=True
-            )
+            for frame, report, missed in zip(dataset, seen.frames, result.missed, strict=True)
         ],
-        "iterations": result.iterations,
+        "iterations": len(seen.history),
         "seconds": result.seconds,
     }
 
@@ -68,7 +68,7 @@ def text(result: HandEye, dataset: Dataset, run: Path) -> list[str]:
     X = result.T_flange_camera
     t, r = 1e3 * X[:3, 3], np.degrees(se3.log_so3(X[:3, :3]))
     sigma = np.sqrt(np.diag(result.covariance))
-    moved = se3.difference(X, result.T_flange_camera_start)
+    moved, seen = se3.difference(X, result.T_flange_camera_start), result.registration
     worst = int(np.argmax(np.linalg.norm(result.missed[:, :3], axis=1)))
     lines = [
         f"{dataset.name}: {result.status.replace('_', ' ')}. {result.reason}",
@@ -87,9 +87,9 @@ def text(result: HandEye, dataset: Dataset, run: Path) -> list[str]:
         shown = " ".join(f"{v:.3f}" for v in np.degrees(result.zeros))
         lines.append(f"  joint zeros   {shown} degrees off")
     lines += [
-        f"  depth         sigma {length(result.sigma)} of the residuals, fixed pattern "
-        f"{length(result.beliefs.pattern)} a wave",
-        f"  time          {result.iterations} iterations, {result.seconds:.1f} s",
+        f"  depth         sigma {length(seen.sigma)} of the residuals, fixed pattern "
+        f"{length(seen.fixed_pattern)}",
+        f"  time          {len(seen.history)} iterations, {result.seconds:.1f} s",
         f"  result        {run / FILE}",
     ]
     return lines

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from depthba.optimiser.certainty import WEAK, direction_name
 from rig.hand_eye.depth.believed import Beliefs
 from rig.hand_eye.depth.chain import Chain
-from rig.hand_eye.depth.descent import Start
+from rig.hand_eye.depth.fit import Start
 from rig.hand_eye.flanges import motion_fault
 from rig.hand_eye.record import Open
 
@@ -39,9 +39,9 @@ def open_directions(covariance: Array, sigma: Array) -> tuple[Open, ...]:
 
 
 def judge(
-    chain: Chain, covariance: Array, start: Start, beliefs: Beliefs, converged: bool
+    chain: Chain, covariance: Array, start: Start, beliefs: Beliefs, ended: str
 ) -> tuple[Status, str, tuple[Open, ...]]:
-    """Return status, reason and what is open."""
+    """Return status, reason and what is open; ``ended``: why it did before it settled, or empty."""
     left_open = open_directions(covariance, start.sigma)
     fault = motion_fault(chain.T_base_flange)
     away = np.abs(start.error(chain)) / start.sigma
@@ -65,6 +65,6 @@ def judge(
             "state a larger --start-error if it may be that far off",
             left_open,
         )
-    if not converged:
-        return "not_converged", "the iterations ended before the transform settled", left_open
+    if ended:
+        return "not_converged", ended, left_open
     return "converged", "motions and depths fix the transform", left_open
