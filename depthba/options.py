@@ -48,6 +48,8 @@ class Options:
     mask: str | None = None
     """Image, of which pixels that are 0 are left out of every frame; or a folder of one image a
     frame, named as its depth image."""
+    most_points: int | None = None
+    """Of more points in all frames together, every so many are left out. None: all are taken."""
     max_iterations: int = 30
     """Limit for each level and phase."""
     time_limit: float | None = None

@@ -54,12 +54,10 @@ class FramePoints:
         """Return every ``stride``-th point."""
         if stride <= 1:
             return self
-        return FramePoints(
-            np.ascontiguousarray(self.points[::stride]),
-            np.ascontiguousarray(self.blocks[::stride]),
-            self.centroid,
-            self.hull,
-            self.extent,
+        return replace(
+            self,
+            points=np.ascontiguousarray(self.points[::stride]),
+            blocks=np.ascontiguousarray(self.blocks[::stride]),
         )
 
 
@@ -88,6 +86,13 @@ class Problem:
     def thinned(self, stride: int) -> Problem:
         """Return the problem with every ``stride``-th point of each frame."""
         return replace(self, frames=tuple(f.thinned(stride) for f in self.frames))
+
+    def at_most(self, points: int) -> Problem:
+        """Return the problem with no more points than so many, evenly thinned."""
+        stride = -(-sum(map(len, self.frames)) // points)
+        if stride <= 1:
+            return self
+        return replace(self.thinned(stride), spacing=self.spacing * float(np.sqrt(stride)))
 
     @property
     def ranges(self) -> float:

@@ -77,6 +77,8 @@ def _register(
 ) -> Result:
     start = start_poses(dataset, options)
     problem = prepare(dataset, start, options.roi)
+    if options.most_points is not None:
+        problem = problem.at_most(options.most_points)
     clock.lap("read")
     sigma_t, sigma_r = pose_sigmas(dataset.pose_noise, options)
     reach = reach_of_poses(dataset.pose_noise, options)

@@ -82,7 +82,7 @@ def check(options: Options) -> None:
         np.isfinite(options.smoothing) and options.smoothing > 0
     ):
         raise OptionError(f"--smoothing {options.smoothing:g}: expected a number above 0")
-    for name in ("threads", "max_iterations"):
+    for name in ("threads", "most_points", "max_iterations"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise OptionError(f"--{name.replace('_', '-')} {value}: expected 1 or more")

@@ -140,6 +140,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         ({"smoothing": -1.0}, "--smoothing -1"),
         ({"threads": 0}, "--threads 0"),
         ({"max_iterations": 0}, "--max-iterations 0"),
+        ({"most_points": 0}, "--most-points 0"),
     ],
 )
 def test_options_that_make_no_sense(scene: Dataset, options: dict[str, Any], named: str) -> None:
@@ -163,6 +164,14 @@ def test_roi_crops(scene: Dataset) -> None:
     whole = depthba.register(scene)
     part = depthba.register(scene, Options(roi=(-0.2, 0.2, -0.2, 0.2, -1.0, 1.0)))
     assert all(0 < p.points < w.points for p, w in zip(part.frames, whole.frames, strict=True))
+
+
+def test_of_many_points_so_many_are_taken(scene: Dataset) -> None:
+    whole, part = depthba.register(scene), depthba.register(scene, Options(most_points=9000))
+    assert 4000 < sum(f.points for f in part.frames) <= 9000 + len(scene)
+    assert part.trusted and part.depth_map.spacing > 1.2 * whole.depth_map.spacing
+    few, all_ = (pose_errors(r.T_world_camera, truth_of(scene)) for r in (part, whole))
+    assert few[0] < 4 * all_[0]
 
 
 def test_folder_that_is_no_dataset(tmp_path: Path) -> None:

@@ -38,6 +38,8 @@ LIMIT = 40
 SHARP = 2.0
 # Standard deviation of a joint's zero, rad, to begin with.
 ZERO = 0.0005
+# Points above which more add little: what limits the transform then is common to all of them.
+ENOUGH = 1_000_000
 # No arm whose joints are not known is taken to be better than this, m and rad.
 ARM_T, ARM_R = 0.0003, 0.0005
 # How far off the frames may be that the arm has held, m and rad: it says how coarse to begin.
@@ -180,7 +182,7 @@ def seen(
         placed(dataset, chain.T_world_camera),
         pose_noise=PoseNoise(_three(t), _three(r), shared),
     )
-    common = MapOptions(resolution=options.resolution, threads=options.threads)
+    common = MapOptions(resolution=options.resolution, threads=options.threads, most_points=ENOUGH)
     first = register(held, common, callback)
     alone = replace(common, priors=False, prior_t=NEAR_T, prior_r=NEAR_R)
     return register(placed(dataset, first.T_world_camera), alone, callback)
