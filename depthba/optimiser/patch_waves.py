@@ -119,9 +119,7 @@ def _gather(
 ):  # fmt: skip
     """Add what some patches say to ``own`` (m, m), lower triangle, ``cross`` and ``gradient``."""
     s, m = patch_kernels.room(first, last, ends, views), len(gradient)
-    b, M, L = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
-    phi, J, row, W = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, m))
-    P = np.zeros((6, 6))
+    b, M, L, W = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, m))
     start = ends[views[first]]
     for k in range(first, last):
         n = patch_kernels.place(k, points, weights, ends, views, Q, o, rays, s)
@@ -132,58 +130,77 @@ def _gather(
             b[j] -= stiff[k] * surface[k, j]
         patch_kernels.firm(M, stiff[k], L)
         begin = ends[views[k]]
-        W[:] = 0.0
-        for i in range(n):
-            patch_kernels.by_surface(phi, i, s)
-            c, w = _cosine(i, s), s[patch_kernels.COUNTS, i]
-            at = waves[begin - start + i]
-            pull = w * c
-            e = pull * s[patch_kernels.OFF, i]
-            for j in range(m):
-                gradient[j] -= e * at[j]
-                t = pull * c * at[j]
-                for other in range(j + 1):
-                    own[j, other] += t * at[other]
-            for a in range(6):
-                t = pull * phi[a]
-                for j in range(m):
-                    W[a, j] += t * at[j]
-        X = surfaces[k]
-        for j in range(m):
-            x = W[:, j].copy()
-            patch_kernels.forward(L, x)
-            patch_kernels.backward(L, x)
-            X[:, j] = x
-        for j in range(m):
-            for a in range(6):
-                gradient[j] += X[a, j] * b[a]
-            for other in range(j + 1):
-                t = 0.0
-                for a in range(6):
-                    t += W[a, j] * X[a, other]
-                own[j, other] -= t
+        here = waves[begin - start : begin - start + n]
+        _sum(n, s, here, own, gradient, W)
+        _eliminate(L, W, b, surfaces[k], own, gradient)
         for view in range(views[k], views[k + 1]):
-            to = cross[frame[view]]
-            P[:] = 0.0
-            for i in range(ends[view] - begin, ends[view + 1] - begin):
-                patch_kernels.by_pose(J, i, s, pivot[view])
-                patch_kernels.by_surface(phi, i, s)
-                patch_kernels.into_map(J.reshape(1, 6), axes[k], row)
-                w = s[patch_kernels.COUNTS, i]
-                pull = w * _cosine(i, s)
-                at = waves[begin - start + i]
-                for a in range(6):
-                    t = pull * row[0, a]
-                    for j in range(m):
-                        to[a, j] -= t * at[j]
-                    for j in range(6):
-                        P[a, j] += w * row[0, a] * phi[j]
+            i, j = ends[view] - begin, ends[view + 1] - begin
+            _couple(i, j, s, here, pivot[view], axes[k], surfaces[k], cross[frame[view]])
+
+
+@nb.njit(cache=True, nogil=True)
+def _sum(n, s, waves, own, gradient, W):
+    """Add a patch's points to ``own`` and ``gradient``; W (6, m) gets surface against pattern."""
+    phi, m = np.zeros(6), len(gradient)
+    W[:] = 0.0
+    for i in range(n):
+        patch_kernels.by_surface(phi, i, s)
+        c, at = _cosine(i, s), waves[i]
+        pull = s[patch_kernels.COUNTS, i] * c
+        e = pull * s[patch_kernels.OFF, i]
+        for j in range(m):
+            gradient[j] -= e * at[j]
+            t = pull * c * at[j]
+            for other in range(j + 1):
+                own[j, other] += t * at[other]
+        for a in range(6):
+            t = pull * phi[a]
+            for j in range(m):
+                W[a, j] += t * at[j]
+
+
+@nb.njit(cache=True, nogil=True)
+def _eliminate(L, W, b, X, own, gradient):
+    """Take the surface out, whose factor is L and gradient b; X (6, m) gets how it follows."""
+    m = len(gradient)
+    for j in range(m):
+        x = W[:, j].copy()
+        patch_kernels.forward(L, x)
+        patch_kernels.backward(L, x)
+        X[:, j] = x
+    for j in range(m):
+        for a in range(6):
+            gradient[j] += X[a, j] * b[a]
+        for other in range(j + 1):
+            t = 0.0
             for a in range(6):
-                for j in range(m):
-                    t = 0.0
-                    for other in range(6):
-                        t += P[a, other] * X[other, j]
-                    to[a, j] += t
+                t += W[a, j] * X[a, other]
+            own[j, other] -= t
+
+
+@nb.njit(cache=True, nogil=True)
+def _couple(first, last, s, waves, pivot, V, X, cross):
+    """Add what a view's points say of its pose and the pattern at once to ``cross`` (6, m)."""
+    phi, J, row, P = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, 6))
+    m = waves.shape[1]
+    for i in range(first, last):
+        patch_kernels.by_pose(J, i, s, pivot)
+        patch_kernels.by_surface(phi, i, s)
+        patch_kernels.into_map(J.reshape(1, 6), V, row)
+        w = s[patch_kernels.COUNTS, i]
+        pull = w * _cosine(i, s)
+        for a in range(6):
+            t = pull * row[0, a]
+            for j in range(m):
+                cross[a, j] -= t * waves[i, j]
+            for j in range(6):
+                P[a, j] += w * row[0, a] * phi[j]
+    for a in range(6):
+        for j in range(m):
+            t = 0.0
+            for k in range(6):
+                t += P[a, k] * X[k, j]
+            cross[a, j] += t
 
 
 @nb.njit(cache=True, nogil=True)
