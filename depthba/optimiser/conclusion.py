@@ -52,12 +52,12 @@ def conclude(
         level.problem, level.grid, State(T_camera_start, filled(averages.heights)),
         outcome.loss, level.smooth, workers, ROUNDS, TOLERANCE,
     )  # fmt: skip
-    outcome_lin = linearise(
-        level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth
-    )
     acting = engine.acting
     cost_start = began_lin.cost + end.temperature * acting.cost(T_camera_start)
-    cost_end = outcome_lin.cost + end.temperature * acting.cost(outcome.state.T_map_camera)
+    cost_end = linearise(
+        level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth
+    ).cost
+    cost_end += end.temperature * acting.cost(outcome.state.T_map_camera)
     if outcome.tied is not None:
         cost_start += outcome.tied.patches.fitted(T_camera_start, workers).cost
         cost_end += outcome.tied.cost

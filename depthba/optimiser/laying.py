@@ -36,13 +36,13 @@ AFRESH = 4
 class Cloud:
     """Points of all frames, some of which may lie on patches."""
 
-    points: Array
+    points: NDArray[np.float32]
     """(n, 3), sensor frame, m."""
     weights: Array
     """(n,), inverse variance relative to the typical one."""
-    frame: Ints
+    frame: NDArray[np.int32]
     """(n,)."""
-    source: Ints
+    source: NDArray[np.int32]
     """(n,), index of each point among those of its frame."""
     rays: bool
     """Whether points lie on rays from the origin of their sensor."""
@@ -52,10 +52,10 @@ class Cloud:
         """Return all points of a problem."""
         parts = [f.points for f in problem.frames]
         return Cloud(
-            np.concatenate([p[:, :3] for p in parts]).astype(np.float64),
+            np.concatenate([p[:, :3] for p in parts]),
             np.concatenate([p[:, 3] for p in parts]).astype(np.float64) ** 2,
-            np.repeat(np.arange(len(parts)), [len(p) for p in parts]),
-            np.concatenate([np.arange(len(p)) for p in parts]),
+            np.repeat(np.arange(len(parts), dtype=np.int32), [len(p) for p in parts]),
+            np.concatenate([np.arange(len(p), dtype=np.int32) for p in parts]),
             problem.origin,
         )
 
@@ -86,7 +86,7 @@ def lay(
         workers: the threads.
     """
     n = len(T_map_camera)
-    x = np.empty_like(cloud.points)
+    x = np.empty(cloud.points.shape)
     laying_kernels.to_map(cloud.points, cloud.frame, T_map_camera, x)
     left, parts = np.arange(len(x)), []
     for side in sides:
@@ -131,7 +131,7 @@ class _Found:
     """(n,), indices of the points on patches, by patch and by frame."""
     sizes: Ints
     """(m,), points of each view."""
-    frame: Ints
+    frame: NDArray[np.int32]
     """(m,), its frame."""
     views: Ints
     """(k,), views of each patch."""
@@ -147,7 +147,9 @@ def _voxels(x: Array, cloud: Cloud, these: Ints, side: float) -> _Found:
     """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m."""
     if not len(these):
         none = np.empty(0, np.int64)
-        return _Found(none, none, none, none, np.empty((0, 3, 3)), np.empty((0, 3)), these)
+        return _Found(
+            none, none, none.astype(np.int32), none, np.empty((0, 3, 3)), np.empty((0, 3)), these
+        )
     voxel, k = _voxel_of(x, these, side)
     order = np.empty_like(these)
     laying_kernels.sort_by(voxel, k, order)

@@ -99,7 +99,7 @@ def _runs(patches: Patches) -> list[tuple[int, int]]:
 def _waves(patches: Patches, waves: Waves, run: tuple[int, int]) -> NDArray[np.float32]:
     """Return the waves (n, m) at the points of a run of patches."""
     first, last = patches.ends[patches.views[list(run)]]
-    return waves.at(patches.points[first:last].astype(np.float32))
+    return waves.at(patches.points[first:last])
 
 
 @nb.njit(cache=True, nogil=True, inline="always")

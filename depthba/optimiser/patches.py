@@ -43,15 +43,15 @@ class Patches:
     A *view* is a frame's points in a patch.
     """
 
-    points: Array
+    points: NDArray[np.float32]
     """(n, 3), sensor frame, m."""
     weights: Array
     """(n,), inverse variance relative to the typical one."""
-    source: Ints
+    source: NDArray[np.int32]
     """(n,), index of each point among those of its frame."""
     ends: Ints
     """(m + 1,), where the points of each view begin and end."""
-    frame: Ints
+    frame: NDArray[np.int32]
     """(m,), the frame of each view."""
     views: Ints
     """(k + 1,), where the views of each patch begin and end."""

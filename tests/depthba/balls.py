@@ -35,7 +35,5 @@ def balls(rng, T, sigma, points=2500, flat=0.0):
         p = (x - pose[:3, 3]) @ pose[:3, :3]
         way = np.linalg.norm(p, axis=1)
         clouds.append(p * (1 + sigma * rng.normal(size=points) / way)[:, None])
-    frame = np.repeat(np.arange(N), points)
-    return Cloud(
-        np.concatenate(clouds), np.ones(N * points), frame, np.tile(np.arange(points), N), True
-    )
+    frame, source = np.indices((N, points), np.int32).reshape(2, -1)
+    return Cloud(np.concatenate(clouds, dtype=np.float32), np.ones(N * points), frame, source, True)

@@ -33,7 +33,7 @@ def fitted(patches, T, workers):
 
 def bent(patches, pattern):
     """The points with a pattern (m,) taken off along their rays."""
-    error = WAVES.at(patches.points.astype(np.float32)) @ pattern
+    error = WAVES.at(patches.points) @ pattern
     way = np.linalg.norm(patches.points, axis=1)
     return replace(patches, points=patches.points * (1 - error / way)[:, None])
 
