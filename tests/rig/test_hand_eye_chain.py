@@ -92,6 +92,15 @@ def test_the_fit_finds_x_and_its_covariance_covers_the_error() -> None:
     assert 0.2 < np.mean(squares) < 1.6
 
 
+def test_frames_of_which_nothing_is_known_leave_x_at_its_start() -> None:
+    true = chain()
+    nothing = Seen(true.T_world_camera, np.arange(0), np.zeros((0, 0)))
+    start = Start(X, np.full(6, 1e-2))
+    found = fit(true, nothing, start, Beliefs(start.sigma, 5e-4, 5e-5, 1e-4))
+    np.testing.assert_allclose(found.chain.T_flange_camera, X, atol=1e-12)
+    np.testing.assert_allclose(np.diag(found.covariance)[:6], start.sigma**2)
+
+
 def test_posterior_weighs_data_and_beliefs() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((5, 5))

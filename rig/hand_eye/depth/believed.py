@@ -1,8 +1,8 @@
 """What is believed of each unknown beside the depth, and how strong each kind of error is.
 
 The unknowns are X, the joints' zeros and the flanges, in this order. How much the last two scatter
-is estimated along with them (expectation maximisation for variance
-components, Dempster, Laird & Rubin 1977), since a robot is rarely as good as its data sheet says.
+is estimated along with them (expectation maximisation for variance components, Dempster, Laird &
+Rubin 1977), since a robot is rarely as good as its data sheet says.
 """
 
 from __future__ import annotations

@@ -30,12 +30,6 @@ from rig.hand_eye.record import Open
 
 Array = NDArray[np.float64]
 
-# The robust loss begins this wide, in robust standard deviations.
-WIDE = 12.0
-LIMIT = 40
-# Change of slope of the map beyond which points take no part in the end: where more is kept the
-# depths contradict the truth, where less is kept they leave the robot's own errors undecided.
-SHARP = 2.0
 # Standard deviation of a joint's zero, rad, to begin with.
 ZERO = 0.0005
 # Points above which more add little: what limits the transform then is common to all of them.

@@ -112,4 +112,4 @@ def relative(chain: Chain, seen: Seen) -> tuple[Array, Array]:
     J = chain.jacobian().reshape(len(T), 6, -1)
     along = np.tile(np.eye(6), (len(seen.known), 1, 1))
     along[:, :3, 3:] = -se3.hat(T[seen.known, :3, 3] - T[0, :3, 3])
-    return e, (J[seen.known] - along @ J[0]).reshape(len(e), -1)
+    return e, (J[seen.known] - along @ J[0]).reshape(len(e), J.shape[-1])
