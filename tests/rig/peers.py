@@ -17,8 +17,9 @@ import pytest
 from rig.errors import RigError
 
 ROOT = Path(__file__).parents[2]
-LONGEST = 5.0
-"""By when a fault has to have ended, s: the issue's bound."""
+LONGEST = float(os.environ.get("FAULT_SECONDS", "60"))
+"""By when a fault has to have ended, s. What takes longer hangs; `tests/benchmarks/test_faults.py`
+asks for the 5 s that are aimed at, which a machine shared with others may miss."""
 
 
 @contextmanager

@@ -122,6 +122,7 @@ def test_a_controller_that_is_killed_during_a_move() -> None:
         arm = UrArm(UrOptions(host))
         arm.connect()
         moved_while(arm, lambda: running.process.send_signal(signal.SIGKILL))
+        running.process.wait()  # its ports are closed from here on
         with ends_in_time(), pytest.raises(ArmError, match=r"30004.*refused") as error:
             arm.connect()
         one_line(error)
