@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import laying_kernels, patch_kernels
+from depthba.optimiser import laying_kernels, patch_points
 from depthba.optimiser.asking import look
 from depthba.optimiser.patches import Fit, Patches
 from depthba.optimiser.problem import Problem
@@ -106,7 +106,7 @@ def lay(
         centre=np.concatenate([p.centre for p in parts]),
         reach=REACH * each,
         stiff=(sigma * each) ** 2,
-        surface=np.zeros((len(each), patch_kernels.TERMS)),
+        surface=np.zeros((len(each), patch_points.TERMS)),
         robust=robust,
         scale=0.0,
         rays=cloud.rays,

@@ -15,7 +15,26 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import patch_kernels
+from depthba.optimiser.patch_points import (
+    COUNTS,
+    OFF,
+    RAY_0,
+    RAY_1,
+    RAY_2,
+    SLOPE_U,
+    SLOPE_V,
+    backward,
+    by_pose,
+    by_surface,
+    firm,
+    forward,
+    into_map,
+    meet,
+    place,
+    room,
+    surface_sums,
+    weigh,
+)
 from depthba.optimiser.patches import Patches
 from depthba.optimiser.waves import Waves
 from depthba.optimiser.workers import Workers
@@ -105,11 +124,7 @@ def _waves(patches: Patches, waves: Waves, run: tuple[int, int]) -> NDArray[np.f
 @nb.njit(cache=True, nogil=True, inline="always")
 def _cosine(i, s):
     """Return the change of a point's distance from the surface with its range."""
-    return (
-        s[patch_kernels.RAY_0, i]
-        + s[patch_kernels.SLOPE_U, i] * s[patch_kernels.RAY_1, i]
-        + s[patch_kernels.SLOPE_V, i] * s[patch_kernels.RAY_2, i]
-    )
+    return s[RAY_0, i] + s[SLOPE_U, i] * s[RAY_1, i] + s[SLOPE_V, i] * s[RAY_2, i]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -118,17 +133,17 @@ def _gather(
     surface, square, waves, own, cross, gradient, surfaces,
 ):  # fmt: skip
     """Add what some patches say to ``own`` (m, m), lower triangle, ``cross`` and ``gradient``."""
-    s, m = patch_kernels.room(first, last, ends, views), len(gradient)
+    s, m = room(first, last, ends, views), len(gradient)
     b, M, L, W = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, m))
     start = ends[views[first]]
     for k in range(first, last):
-        n = patch_kernels.place(k, points, weights, ends, views, Q, o, rays, s)
-        patch_kernels.meet(n, surface[k], rays, reach[k], s)
-        patch_kernels.weigh(n, square, s)
-        patch_kernels.surface_sums(n, s, M, b)
+        n = place(k, points, weights, ends, views, Q, o, rays, s)
+        meet(n, surface[k], rays, reach[k], s)
+        weigh(n, square, s)
+        surface_sums(n, s, M, b)
         for j in range(3, 6):
             b[j] -= stiff[k] * surface[k, j]
-        patch_kernels.firm(M, stiff[k], L)
+        firm(M, stiff[k], L)
         begin = ends[views[k]]
         here = waves[begin - start : begin - start + n]
         _sum(n, s, here, own, gradient, W)
@@ -144,10 +159,10 @@ def _sum(n, s, waves, own, gradient, W):
     phi, m = np.zeros(6), len(gradient)
     W[:] = 0.0
     for i in range(n):
-        patch_kernels.by_surface(phi, i, s)
+        by_surface(phi, i, s)
         c, at = _cosine(i, s), waves[i]
-        pull = s[patch_kernels.COUNTS, i] * c
-        e = pull * s[patch_kernels.OFF, i]
+        pull = s[COUNTS, i] * c
+        e = pull * s[OFF, i]
         for j in range(m):
             gradient[j] -= e * at[j]
             t = pull * c * at[j]
@@ -165,8 +180,8 @@ def _eliminate(L, W, b, X, own, gradient):
     m = len(gradient)
     for j in range(m):
         x = W[:, j].copy()
-        patch_kernels.forward(L, x)
-        patch_kernels.backward(L, x)
+        forward(L, x)
+        backward(L, x)
         X[:, j] = x
     for j in range(m):
         for a in range(6):
@@ -184,10 +199,10 @@ def _couple(first, last, s, waves, pivot, V, X, cross):
     phi, J, row, P = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, 6))
     m = waves.shape[1]
     for i in range(first, last):
-        patch_kernels.by_pose(J, i, s, pivot)
-        patch_kernels.by_surface(phi, i, s)
-        patch_kernels.into_map(J.reshape(1, 6), V, row)
-        w = s[patch_kernels.COUNTS, i]
+        by_pose(J, i, s, pivot)
+        by_surface(phi, i, s)
+        into_map(J.reshape(1, 6), V, row)
+        w = s[COUNTS, i]
         pull = w * _cosine(i, s)
         for a in range(6):
             t = pull * row[0, a]
@@ -209,18 +224,18 @@ def _score(
     surfaces, groups, out,
 ):  # fmt: skip
     """Add the pattern's reduced gradient of each group of points to ``out`` (kinds, groups, m)."""
-    s, m = patch_kernels.room(first, last, ends, views), out.shape[2]
+    s, m = room(first, last, ends, views), out.shape[2]
     phi, v = np.zeros(6), np.zeros(m)
     start = ends[views[first]]
     for k in range(first, last):
-        n = patch_kernels.place(k, points, weights, ends, views, Q, o, rays, s)
-        patch_kernels.meet(n, surface[k], rays, reach[k], s)
-        patch_kernels.weigh(n, square, s)
+        n = place(k, points, weights, ends, views, Q, o, rays, s)
+        meet(n, surface[k], rays, reach[k], s)
+        weigh(n, square, s)
         begin = ends[views[k]]
         for i in range(n):
-            patch_kernels.by_surface(phi, i, s)
+            by_surface(phi, i, s)
             c = _cosine(i, s)
-            wr = s[patch_kernels.COUNTS, i] * s[patch_kernels.OFF, i]
+            wr = s[COUNTS, i] * s[OFF, i]
             for j in range(m):
                 t = -c * waves[begin - start + i, j]
                 for a in range(6):

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import patch_kernels
+from depthba.optimiser import patch_kernels, patch_points
 from depthba.optimiser.workers import SHARES, Workers
 
 Array = NDArray[np.float64]
@@ -177,7 +177,7 @@ class Patches:
     def local(self, T: Array) -> tuple[Array, Array]:
         """Return Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
         Q, o = np.empty((len(self.frame), 3, 3)), np.empty((len(self.frame), 3))
-        patch_kernels.local(self.frame, self.views, self.axes, self.centre, T, Q, o)
+        patch_points.local(self.frame, self.views, self.axes, self.centre, T, Q, o)
         return Q, o
 
     def in_patches(self, pivots: Array) -> Array:
