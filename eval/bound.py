@@ -182,14 +182,14 @@ def _cleaned(problem: Problem, dataset: Dataset, clean: Sequence[NDArray[np.floa
     frames = []
     for frame, depth in zip(problem.frames, clean, strict=True):
         points = frame.points.copy()
-        pixel = np.rint(camera.project(points[:, :3])).astype(int)
+        pixel = np.rint(camera.project(points)).astype(int)
         u = np.clip(pixel[:, 0], 0, camera.width - 1)
         v = np.clip(pixel[:, 1], 0, camera.height - 1)
         exact = np.asarray(depth, dtype=float)[v, u]
         known = np.isfinite(exact) & (exact > 0)
-        points[known, :3] *= (exact[known] / points[known, 2])[:, None].astype(np.float32)
-        points[~known, 4] = 0.0
-        frames.append(replace(frame, points=points))
+        points[known] *= (exact[known] / points[known, 2])[:, None].astype(np.float32)
+        share = np.where(known, frame.share, np.float32(0.0))
+        frames.append(replace(frame, points=points, share=share))
     return replace(problem, frames=tuple(frames))
 
 
@@ -256,9 +256,8 @@ def _by_range(problem: Problem, grid: Grid, state: State, loss: Loss) -> Problem
         nu = fronts[i] * (u[2] - (feet.slopes * u[:2]).sum(axis=0))
         normal = 1.0 + (feet.slopes**2).sum(axis=0)
         asked = np.maximum(nu, kernels.GRAZING)
-        points = frame.points.copy()
-        points[:, 3] *= np.sqrt(nu**2 + kernels.LATERAL * normal) / asked
-        return replace(frame, points=points)
+        less = (np.sqrt(nu**2 + kernels.LATERAL * normal) / asked).astype(np.float32)
+        return replace(frame, inverse_noise=frame.inverse_noise * less)
 
     frames = tuple(weighed(i) for i in range(len(problem.frames)))
     return replace(problem, frames=frames)

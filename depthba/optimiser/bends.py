@@ -44,10 +44,8 @@ def without_bends(
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         look()
-        xy = frame.points[:, :3] @ T[:2, :3].T + T[:2, 3]
+        xy = frame.points @ T[:2, :3].T + T[:2, 3]
         k = np.rint((xy - grid.origin) / grid.spacing).astype(int)
         x, y = np.clip(k, 0, [grid.shape[1] - 1, grid.shape[0] - 1]).T
-        points = frame.points.copy()
-        points[sharp[y, x], 4] = 0.0
-        frames.append(replace(frame, points=points))
+        frames.append(replace(frame, share=np.where(sharp[y, x], np.float32(0.0), frame.share)))
     return replace(problem, frames=tuple(frames))

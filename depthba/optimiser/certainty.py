@@ -195,8 +195,9 @@ def block_scores(
             frame, T, foot = problem.frames[i], state.T_map_camera[i], lin.B[i]
             feet, pulls = ground.feet(i), np.empty(len(frame))
             probes.contributions(
-                frame.points, feet.on, feet.arms, feet.slopes, feet.norm2, feet.residuals,
-                T[:3, 3] - lin.pivots[i], lin.weights[i], groups[i], pulls, scores[i],
+                frame.inverse_noise, frame.share, feet.on, feet.arms, feet.slopes, feet.norm2,
+                feet.residuals, T[:3, 3] - lin.pivots[i], lin.weights[i], groups[i], pulls,
+                scores[i],
             )  # fmt: skip
             for other, answer in enumerate(answers):
                 if coupling.meet(foot, answer):

@@ -220,11 +220,11 @@ def feet(points, R, t, origin, spacing, nodes, along_ray, slope, front, cap, row
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _weigh(points, c2, s, w, weights, residuals):
+def _weigh(inverse_noise, shares, c2, s, w, weights, residuals):
     """Give every point its robust weight and normalised residual; ``w`` is its whole weight."""
     r, norm2, on = s[RESIDUAL], s[NORM2], s[ON]
-    for k in range(points.shape[0]):
-        own, share = np.float64(points[k, 3]), np.float64(points[k, 4])
+    for k in range(shares.shape[0]):
+        own, share = np.float64(inverse_noise[k]), np.float64(shares[k])
         counts = on[k] if share > 0.0 else 0.0
         on[k] = counts
         scale2 = own * own / norm2[k]
@@ -236,12 +236,12 @@ def _weigh(points, c2, s, w, weights, residuals):
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _cost(points, c2, charge, s):
+def _cost(inverse_noise, shares, c2, charge, s):
     """Geman-McClure cost of a chunk at the squared scale ``c2``; 0: squares."""
     r, norm2, on = s[RESIDUAL], s[NORM2], s[ON]
     cost = 0.0
-    for k in range(points.shape[0]):
-        own, share = np.float64(points[k, 3]), np.float64(points[k, 4])
+    for k in range(shares.shape[0]):
+        own, share = np.float64(inverse_noise[k]), np.float64(shares[k])
         e2 = r[k] * r[k] * own * own / norm2[k]
         e2 = c2 / (c2 + e2) * e2 if c2 > 0.0 else e2
         cost += share * (on[k] * e2 + (1.0 - on[k]) * charge)
@@ -337,14 +337,14 @@ def _scatter(n, s, cells, w, wJ, B, bx, by, stencil):
 
 @nb.njit(cache=True, nogil=True)
 def accumulate(
-    points, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
+    points, inverse_noise, shares, R, t, arm, origin, spacing, nodes, along_ray, slope, front, cap,
     robust_c, judged_c, charge,
     weights, residuals, stencil, A, g, B, bx, by,
 ):  # fmt: skip
     """Run over a frame's points once and accumulate all of its normal equations.
 
-    A point (of n, 5) is x, y, z in the sensor frame, m, the inverse of its relative noise, and its
-    share: a factor on its cost. Adds to the frame's ``A`` (6, 6), ``g`` (6,) and ``B`` (h, w, 6;
+    With each point, (n, 3) in the sensor frame, m, go the inverse of its relative noise and its
+    share, a factor on its cost. Adds to the frame's ``A`` (6, 6), ``g`` (6,) and ``B`` (h, w, 6;
     its corner at node (bx, by)) and to the map's ``stencil`` (ny, nx, 6): the node's own term, its
     couplings to x+1, y+1, (x+1, y+1), of x+1 with y+1, and gradient. ``arm`` is the sensor's centre
     relative to the pivot. Writes each point's robust weight and normalised residual (NaN off the
@@ -359,22 +359,23 @@ def accumulate(
     s, cells = np.empty((ROWS, CHUNK)), np.empty((2, CHUNK), np.int32)
     far, far_cells = np.empty((ROWS, CHUNK)), np.empty((3, CHUNK), np.int32)
     w, J, wJ = np.empty(CHUNK), np.empty((6, CHUNK)), np.empty((6, CHUNK))
-    own = np.zeros((6, 6))
+    block = np.zeros((6, 6))
     for first in range(0, points.shape[0], CHUNK):
         last = min(first + CHUNK, points.shape[0])
-        chunk, n = points[first:last], last - first
+        own, share, n = inverse_noise[first:last], shares[first:last], last - first
         _land(
-            chunk, pose, bounds, nodes, along_ray, slope, front, cap, s, cells, far, far_cells
+            points[first:last], pose, bounds, nodes, along_ray, slope, front, cap, s, cells, far,
+            far_cells,
         )  # fmt: skip
-        _weigh(chunk, c2, s, w, weights[first:last], residuals[first:last])
-        part = _cost(chunk, c2, charge, s)
+        _weigh(own, share, c2, s, w, weights[first:last], residuals[first:last])
+        part = _cost(own, share, c2, charge, s)
         cost += part
-        judged += part if j2 == c2 else _cost(chunk, j2, charge, s)
+        judged += part if j2 == c2 else _cost(own, share, j2, charge, s)
         used += s[ON, :n].sum()
         _differentiate(n, arm, s, w, J, wJ)
-        _sum(n, s[RESIDUAL], J, wJ, own, g)
+        _sum(n, s[RESIDUAL], J, wJ, block, g)
         _scatter(n, s, cells, w, wJ, B, bx, by, stencil)
     for m in range(6):
         for j in range(6):
-            A[m, j] += own[max(m, j), min(m, j)]
+            A[m, j] += block[max(m, j), min(m, j)]
     return cost, judged, used

@@ -38,13 +38,12 @@ def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: 
     factor = 1.0 / np.maximum(1.0, rough)
     frames = []
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
-        points = frame.points.copy()
-        a = _look_up(factor, frame.points, T, grid)
-        points[:, 3] *= a
+        a = _look_up(factor, frame.points, T, grid).astype(np.float32)
         # what a rough cell scatters is not noise but bias: it gets less than the weight of its
         # variance
-        points[:, 4] *= a**2
-        frames.append(replace(frame, points=points))
+        frames.append(
+            replace(frame, inverse_noise=frame.inverse_noise * a, share=frame.share * a**2)
+        )
     return replace(problem, frames=tuple(frames))
 
 

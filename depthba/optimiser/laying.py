@@ -50,12 +50,12 @@ class Cloud:
     @staticmethod
     def of(problem: Problem) -> Cloud:
         """Return all points of a problem."""
-        parts = [f.points for f in problem.frames]
+        sizes = [len(f) for f in problem.frames]
         return Cloud(
-            np.concatenate([p[:, :3] for p in parts]),
-            np.concatenate([p[:, 3] for p in parts]).astype(np.float64) ** 2,
-            np.repeat(np.arange(len(parts), dtype=np.int32), [len(p) for p in parts]),
-            np.concatenate([np.arange(len(p), dtype=np.int32) for p in parts]),
+            np.concatenate([f.points for f in problem.frames]),
+            np.concatenate([f.inverse_noise for f in problem.frames]).astype(np.float64) ** 2,
+            np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
+            np.concatenate([np.arange(n, dtype=np.int32) for n in sizes]),
             problem.origin,
         )
 

@@ -161,12 +161,12 @@ def linearise(
         for i in frames:
             look()
             B[i].values.fill(0.0)
-            pose = state.T_map_camera[i]
+            frame, pose = problem.frames[i], state.T_map_camera[i]
             costs[i] = kernels.accumulate(
-                problem.frames[i].points, pose[:3, :3].copy(), pose[:3, 3].copy(),
-                pose[:3, 3] - pivots[i], grid.origin, grid.spacing, scratch.nodes,
-                loss.along_ray, loss.slope, fronts[i], loss.cap, loss.robust_c, judge.robust_c,
-                judge.charge, weights[i], residuals[i], total,
+                frame.points, frame.inverse_noise, frame.share, pose[:3, :3].copy(),
+                pose[:3, 3].copy(), pose[:3, 3] - pivots[i], grid.origin, grid.spacing,
+                scratch.nodes, loss.along_ray, loss.slope, fronts[i], loss.cap, loss.robust_c,
+                judge.robust_c, judge.charge, weights[i], residuals[i], total,
                 A[i], g[i], B[i].values, B[i].x, B[i].y,
             )  # fmt: skip
 

@@ -114,7 +114,6 @@ class Registration:
         self._ids: list[int] = []
         self._digests: dict[bytes, int] = {}
         self._stamps: list[float] = []
-        self._clouds: list[NDArray[np.float32]] = []
         self._frames: list[FramePoints] = []
         self._T_world_measured: list[NDArray[np.float64]] = []
         self._T_map_camera: list[NDArray[np.float64]] = []
@@ -181,10 +180,10 @@ class Registration:
         points = frame_points(cloud, self._sensor, self._typical)
         if earlier is not None:
             points = replace(points, refused=repeat_reason(earlier))
-        clouds, frames = [*self._clouds, cloud], [*self._frames, points]
+        frames = [*self._frames, points]
         poses = np.stack([*self._T_map_camera, T])
         worlds = np.stack([*self._T_world_measured, frame.T_world_camera])
-        problem = self._problem(clouds, frames, worlds)
+        problem = self._problem(frames, worlds)
         overlap = overlap_matrix(problem, poses, problem.spacing)
         held = held_frames(problem, overlap)
         if len(frames) > 1 and not held[-1]:
@@ -194,7 +193,7 @@ class Registration:
         self._digests.setdefault(digest, frame.id)
         self._ids.append(frame.id)
         self._stamps.append(frame.stamp)
-        self._clouds, self._frames = clouds, frames
+        self._frames = frames
         self._T_world_measured.append(frame.T_world_camera)
         self._T_map_camera = list(poses)
         return Update(
@@ -209,7 +208,7 @@ class Registration:
         if sum(len(f) > 0 for f in self._frames) < 2:
             raise DatasetError("registration needs 2 or more frames with valid depth")
         measured = np.stack(self._T_world_measured)
-        problem = self._problem(self._clouds, self._frames, measured)
+        problem = self._problem(self._frames, measured)
         finest = self.options.resolution or schedule.finest_spacing(problem)
         overlap = overlap_matrix(problem, problem.T_map_camera, finest)
         held = held_frames(problem, overlap)
@@ -249,14 +248,9 @@ class Registration:
         self._typical = typical_noise(self._sensor, [cloud])
         self._spacing = point_spacing(self._sensor, [cloud])
 
-    def _problem(
-        self,
-        clouds: list[NDArray[np.float32]],
-        frames: list[FramePoints],
-        T_world_camera: NDArray[np.float64],
-    ) -> Problem:
+    def _problem(self, frames: list[FramePoints], T_world_camera: NDArray[np.float64]) -> Problem:
         start = self._T_map_world @ T_world_camera
-        lower, upper = bounds(clouds, start)
+        lower, upper = bounds([f.points for f in frames], start)
         return Problem(
             frames=tuple(frames),
             T_map_camera=start,
@@ -291,7 +285,7 @@ class Registration:
             frames=tuple(problem.frames[i] for i in chosen),
             T_map_camera=poses[chosen],
         )
-        lower, upper = bounds([problem.frames[i].points[:, :3] for i in chosen], poses[chosen])
+        lower, upper = bounds([problem.frames[i].points for i in chosen], poses[chosen])
         part = replace(part, lower=lower, upper=upper)
         finest = COARSER * (self.options.resolution or schedule.finest_spacing(problem))
         levels = [s for s in schedule.spacings(self.options, part, *self._reach) if s > finest] or [

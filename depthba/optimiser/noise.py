@@ -27,18 +27,30 @@ LEAST, MOST = 0.7, 2.5
 SAME = 1.02
 
 
+@dataclass(frozen=True)
+class Studentised:
+    """Residuals of some points of a frame, each by what its leverage leaves of its noise."""
+
+    sizes: Array
+    """(n,), m."""
+    ranges: Array
+    """(n,), m."""
+    whole: NDArray[np.bool_]
+    """(n,), whether all of the point's cost counts."""
+
+
 def noise_sigma(
     problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation
 ) -> float:
     """Return the robust standard deviation of the points' noise, m."""
-    each = np.concatenate([r for r, _ in studentised(problem, grid, state, loss, lin)])
+    each = np.concatenate([s.sizes for s in studentised(problem, grid, state, loss, lin)])
     return _deviation(each) if len(each) else robust_sigma(lin.residuals)
 
 
 def studentised(
     problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation
-) -> list[tuple[Array, NDArray[np.float32]]]:
-    """Return for some points of each frame the size of their residuals, m, and the points (n, 5).
+) -> list[Studentised]:
+    """Return the size of the residuals of some points of each frame.
 
     A map with few points on a node follows them, so that their residuals are smaller than their
     noise: each is divided by the root of what its leverage leaves (the externally known part of a
@@ -48,15 +60,15 @@ def studentised(
     found = []
     for i, frame in enumerate(problem.frames):
         stride = max(1, len(frame) // SAMPLE)
-        feet, some = ground.feet(i, stride), frame.points[::stride]
+        some, feet = frame.thinned(stride), ground.feet(i, stride)
         pull = np.empty(len(some))
         probes.leverages(
-            some, feet.on, feet.cells, feet.fractions, feet.norm2, lin.weights[i][::stride],
-            lin.C.own, pull,
+            some.inverse_noise, some.share, feet.on, feet.cells, feet.fractions, feet.norm2,
+            lin.weights[i][::stride], lin.C.own, pull,
         )  # fmt: skip
         free = pull < FOLLOWED
-        size = np.abs(lin.residuals[i][::stride][free]) / np.sqrt(1.0 - pull[free])
-        found.append((size, some[free]))
+        sizes = np.abs(lin.residuals[i][::stride][free]) / np.sqrt(1.0 - pull[free])
+        found.append(Studentised(sizes, _ranges(some.points[free]), some.share[free] >= 1.0))
     return found
 
 
@@ -86,9 +98,8 @@ class ByRange:
         return replace(problem, frames=tuple(map(self._of, problem.frames)))
 
     def _of(self, frame: FramePoints) -> FramePoints:
-        points = frame.points.copy()
-        points[:, 3] /= np.interp(_ranges(points), self.ranges, self.factors)
-        return replace(frame, points=points)
+        factor = np.interp(_ranges(frame.points), self.ranges, self.factors).astype(np.float32)
+        return replace(frame, inverse_noise=frame.inverse_noise / factor)
 
 
 def by_range(problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linearisation) -> ByRange:
@@ -98,9 +109,8 @@ def by_range(problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linear
     (Davidian & Carroll 1987).
     """
     seen = studentised(problem, grid, state, loss, lin)
-    points = np.concatenate([p for _, p in seen])
-    plain = points[:, 4] >= 1.0
-    sizes, away = np.concatenate([r for r, _ in seen])[plain], _ranges(points[plain])
+    sizes = np.concatenate([s.sizes[s.whole] for s in seen])
+    away = np.concatenate([s.ranges[s.whole] for s in seen])
     if not problem.origin or len(sizes) < 2 * FEWEST:
         return ByRange.as_stated()
     order = np.argsort(away, kind="stable")
@@ -120,4 +130,4 @@ def _deviation(sizes: Array) -> float:
 
 
 def _ranges(points: NDArray[np.float32]) -> Array:
-    return np.asarray(np.linalg.norm(points[:, :3].astype(float), axis=1))
+    return np.asarray(np.linalg.norm(points.astype(float), axis=1))

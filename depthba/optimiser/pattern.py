@@ -53,8 +53,8 @@ def without(problem: Problem, pattern: Array) -> Problem:
     for frame in problem.frames:
         points = frame.points.copy()
         error = waves.at(points) @ pattern.astype(np.float32)
-        away = np.linalg.norm(points[:, :3], axis=1)
-        points[:, :3] *= (1 - error / np.maximum(away, 1e-6))[:, None]
+        away = np.linalg.norm(points, axis=1)
+        points *= (1 - error / np.maximum(away, 1e-6))[:, None]
         frames.append(replace(frame, points=points))
     return replace(problem, frames=tuple(frames))
 
@@ -100,7 +100,7 @@ def share_of(frame: FramePoints, feet: Feet, weights: NDArray[np.float32], waves
     away = np.sqrt(x * x + y * y + z * z)
     change = (z - gx * x - gy * y) / np.maximum(away, 1e-9)
     counts = (feet.on > 0) & (weights > 0) & np.isfinite(change)
-    own, part = frame.points[:, 3].astype(float), frame.points[:, 4]
+    own, part = frame.inverse_noise.astype(float), frame.share
     weight = np.where(counts, part * weights * own**2 / np.where(counts, feet.norm2, 1.0), 0.0)
     change = np.where(counts, change, 0.0)
     return Share(waves.at(frame.points), change.astype(np.float32), weight.astype(np.float32))

@@ -17,18 +17,20 @@ def _shares(a, b):
 
 
 @nb.njit(cache=True, nogil=True)
-def contributions(points, on, arms, slopes, norm2, residuals, arm, weights, groups, pulls, scores):
+def contributions(
+    inverse_noise, shares, on, arms, slopes, norm2, residuals, arm, weights, groups, pulls, scores
+):  # fmt: skip
     """Write what every point adds to the gradients.
 
     ``pulls`` (n,) gets its weighted residual, 0 where it does not count. What it adds to the
     frame's own gradient goes to ``scores`` (kinds, groups, 6), by its group in each row of
     ``groups`` (kinds, n). ``arm`` is the sensor's centre relative to the pivot.
     """
-    for k in range(points.shape[0]):
+    for k in range(shares.shape[0]):
         if on[k] == 0.0 or weights[k] <= 0.0:
             pulls[k] = 0.0
             continue
-        wr = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2[k] * residuals[k]
+        wr = shares[k] * weights[k] * np.float64(inverse_noise[k]) ** 2 / norm2[k] * residuals[k]
         pulls[k] = wr
         gx, gy = slopes[0, k], slopes[1, k]
         lx, ly, lz = arms[0, k] + arm[0], arms[1, k] + arm[1], arms[2, k] + arm[2]
@@ -64,14 +66,16 @@ def answered(cells, fractions, pulls, groups, answer, left, low, scores):
 
 
 @nb.njit(cache=True, nogil=True)
-def noise_gradient(points, on, cells, fractions, norm2, weights, draws, gradient):
+def noise_gradient(
+    inverse_noise, shares, on, cells, fractions, norm2, weights, draws, gradient
+):  # fmt: skip
     """Add to ``gradient`` (ny, nx) what residuals ``draws`` (n,) times the points' sigma would."""
-    for k in range(points.shape[0]):
+    for k in range(shares.shape[0]):
         if on[k] == 0.0 or weights[k] <= 0.0:
             continue
         h00, h10, h01, h11 = _shares(fractions[0, k], fractions[1, k])
         x, y = cells[0, k], cells[1, k]
-        e = points[k, 4] * weights[k] * points[k, 3] / np.sqrt(norm2[k]) * draws[k]
+        e = shares[k] * weights[k] * inverse_noise[k] / np.sqrt(norm2[k]) * draws[k]
         gradient[y, x] -= h00 * e
         gradient[y, x + 1] -= h10 * e
         gradient[y + 1, x] -= h01 * e
@@ -80,27 +84,27 @@ def noise_gradient(points, on, cells, fractions, norm2, weights, draws, gradient
 
 @nb.njit(cache=True, nogil=True)
 def slope_noise(
-    points, on, cells, fractions, arms, norm2, arm, weights, noise, A, B, bx, by
+    inverse_noise, shares, on, cells, fractions, arms, norm2, arm, weights, noise, A, B, bx, by
 ):  # fmt: skip
     """Accumulate ``A`` (6, 6) and ``B`` (h, w, 6) of Jacobians that hold slope noise alone.
 
     ``noise`` (ny, nx, 3) are nodes of a map that is nothing but noise. Only the lower triangle of
     ``A`` is filled.
     """
-    j, shares = np.zeros(6), np.zeros(4)
-    for k in range(points.shape[0]):
+    j, h = np.zeros(6), np.zeros(4)
+    for k in range(shares.shape[0]):
         x, y = cells[0, k] - bx, cells[1, k] - by
         if on[k] == 0.0 or weights[k] <= 0.0:
             continue
         if x < 0 or y < 0 or x + 1 >= B.shape[1] or y + 1 >= B.shape[0]:
             continue
-        w = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2[k]
-        shares[0], shares[1], shares[2], shares[3] = _shares(fractions[0, k], fractions[1, k])
+        w = shares[k] * weights[k] * np.float64(inverse_noise[k]) ** 2 / norm2[k]
+        h[0], h[1], h[2], h[3] = _shares(fractions[0, k], fractions[1, k])
         gx, gy = 0.0, 0.0
         for m in range(4):
             node = noise[cells[1, k] + m // 2, cells[0, k] + m % 2]
-            gx += shares[m] * node[1]
-            gy += shares[m] * node[2]
+            gx += h[m] * node[1]
+            gy += h[m] * node[2]
         lx, ly, lz = arms[0, k] + arm[0], arms[1, k] + arm[1], arms[2, k] + arm[2]
         j[0], j[1], j[2] = -gx, -gy, 0.0
         j[3], j[4], j[5] = lz * gy, -lz * gx, -lx * gy + ly * gx
@@ -110,23 +114,23 @@ def slope_noise(
         for m in range(4):
             node = B[y + m // 2, x + m % 2]
             for n in range(6):
-                node[n] -= shares[m] * w * j[n]
+                node[n] -= h[m] * w * j[n]
 
 
 @nb.njit(cache=True, nogil=True)
-def leverages(points, on, cells, fractions, norm2, weights, own, out):
+def leverages(inverse_noise, shares, on, cells, fractions, norm2, weights, own, out):
     """Write to ``out`` (n,) how much every point pulls the map to itself.
 
     0: not at all, 1: the map follows it. ``own`` (ny, nx) is the map's diagonal, which is right on
     average over evenly spread points. NaN off the map.
     """
-    for k in range(points.shape[0]):
+    for k in range(shares.shape[0]):
         out[k] = np.nan
         if on[k] == 0.0 or weights[k] <= 0.0:
             continue
         h00, h10, h01, h11 = _shares(fractions[0, k], fractions[1, k])
         x, y = cells[0, k], cells[1, k]
-        out[k] = points[k, 4] * weights[k] * np.float64(points[k, 3]) ** 2 / norm2[k] * (
+        out[k] = shares[k] * weights[k] * np.float64(inverse_noise[k]) ** 2 / norm2[k] * (
             h00 * h00 / own[y, x] + h10 * h10 / own[y, x + 1]
             + h01 * h01 / own[y + 1, x] + h11 * h11 / own[y + 1, x + 1]
         )  # fmt: skip

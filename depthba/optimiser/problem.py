@@ -32,8 +32,11 @@ class FramePoints:
     """The points of one frame, in the sensor frame."""
 
     points: NDArray[np.float32]
-    """(n, 5): x, y, z in metres, the inverse of the point's noise relative to the typical one, and
-    the share of its cost that counts."""
+    """(n, 3), m."""
+    inverse_noise: NDArray[np.float32]
+    """(n,), the inverse of each point's noise relative to the typical one."""
+    share: NDArray[np.float32]
+    """(n,), how much of each point's cost counts."""
     blocks: NDArray[np.uint8]
     """(n,), the block of the image that each point lies in."""
     centroid: NDArray[np.float64]
@@ -57,6 +60,8 @@ class FramePoints:
         return replace(
             self,
             points=np.ascontiguousarray(self.points[::stride]),
+            inverse_noise=np.ascontiguousarray(self.inverse_noise[::stride]),
+            share=np.ascontiguousarray(self.share[::stride]),
             blocks=np.ascontiguousarray(self.blocks[::stride]),
         )
 
@@ -312,16 +317,18 @@ def frame_points(points: NDArray[np.float32], sensor: Sensor, typical: float) ->
     look()
     n = len(points)
     if n == 0:
+        none = np.zeros(0, np.float32)
         return FramePoints(
-            np.zeros((0, 5), np.float32), np.zeros(0, np.uint8), np.zeros(3), np.zeros((1, 3)), 0.0
+            points, none, none, np.zeros(0, np.uint8), np.zeros(3), np.zeros((1, 3)), 0.0
         )
-    weighted = np.ones((n, 5), np.float32)
-    weighted[:, :3] = points
+    inverse_noise = share = np.ones(n, np.float32)
     if sensor.noise is not None:
-        weighted[:, 3] = np.clip(typical / _sigmas(sensor.noise, points), 1 / UNLIKE, UNLIKE)
+        known = np.clip(typical / _sigmas(sensor.noise, points), 1 / UNLIKE, UNLIKE)
+        inverse_noise = known.astype(np.float32)
     centroid = points.mean(axis=0, dtype=float)
     extent = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
-    return FramePoints(weighted, _blocks(points, sensor), centroid, extremes(points), extent)
+    blocks = _blocks(points, sensor)
+    return FramePoints(points, inverse_noise, share, blocks, centroid, extremes(points), extent)
 
 
 def _blocks(points: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:

@@ -182,7 +182,8 @@ def noise_linearisation(
     for i, frame in enumerate(problem.frames):
         feet = ground.feet(i)
         probes.noise_gradient(
-            frame.points, feet.on, feet.cells, feet.fractions, feet.norm2, lin.weights[i],
+            frame.inverse_noise, frame.share, feet.on, feet.cells, feet.fractions, feet.norm2,
+            lin.weights[i],
             rng.standard_normal(len(frame)), total,
         )  # fmt: skip
     heights, _ = lin.C.solve(-total, 1e-4)
@@ -194,8 +195,8 @@ def noise_linearisation(
     def filled(i: int) -> None:
         feet, frame = ground.feet(i), problem.frames[i]
         probes.slope_noise(
-            frame.points, feet.on, feet.cells, feet.fractions, feet.arms, feet.norm2,
-            state.T_map_camera[i, :3, 3] - lin.pivots[i], lin.weights[i], noise, A[i],
+            frame.inverse_noise, frame.share, feet.on, feet.cells, feet.fractions, feet.arms,
+            feet.norm2, state.T_map_camera[i, :3, 3] - lin.pivots[i], lin.weights[i], noise, A[i],
             B[i].values, B[i].x, B[i].y,
         )  # fmt: skip
 

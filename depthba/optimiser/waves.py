@@ -47,11 +47,11 @@ class Waves:
         return len(self.rms)
 
     def at(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return (n, m), m: by how much a unit of each wave moves points (n, 3+) along their rays.
+        """Return (n, m), m: by how much a unit of each wave moves points (n, 3) along their rays.
 
         At a point of typical noise; farther and noisier points are moved by more.
         """
-        p = points[:, :3].astype(float)
+        p = points.astype(float)
         u, v = (p[:, :2] / p[:, 2:] * self.scale + self.offset).T
         out = self.over_image(u, v)
         if self.noise is not None:

@@ -34,12 +34,20 @@ class Case:
 
 def frame_points(cloud: Floats) -> FramePoints:
     """Wrap (n, 5) rows: point, inverse noise, share."""
-    points = np.ascontiguousarray(cloud, np.float32)
-    xyz = points[:, :3].astype(float)
+    points, inverse_noise, share = np.split(cloud.astype(np.float32), [3, 4], axis=1)
+    xyz = points.astype(float)
     centroid = xyz.mean(axis=0)
     extent = float(np.sqrt(((xyz - centroid) ** 2).sum(axis=1).mean()))
     blocks = (np.arange(len(points)) % 48).astype(np.uint8)
-    return FramePoints(points, blocks, centroid, extremes(points[:, :3]), extent)
+    return FramePoints(
+        np.ascontiguousarray(points), inverse_noise.ravel(), share.ravel(), blocks, centroid,
+        extremes(points), extent,
+    )  # fmt: skip
+
+
+def rows_of(frame: FramePoints) -> Floats:
+    """Return the (n, 5) rows of a frame again."""
+    return np.column_stack([frame.points, frame.inverse_noise, frame.share]).astype(float)
 
 
 def problem_of(clouds: list[Floats], T_map_camera: Floats, spacing: float = 0.02) -> Problem:

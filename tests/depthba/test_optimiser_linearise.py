@@ -16,6 +16,7 @@ from tests.depthba.optimiser_problems import (
     Case,
     awkward_case,
     dense_of,
+    rows_of,
 )
 
 STEPS = 1e-6 * np.eye(3)
@@ -27,7 +28,7 @@ def rotation(euler: np.ndarray) -> np.ndarray:
 
 def judged_by(case: Case, loss: Loss, pivots: np.ndarray) -> reference.Dense:
     return reference.normal_equations(
-        [f.points.astype(float) for f in case.problem.frames], case.state.T_map_camera, pivots,
+        [rows_of(f) for f in case.problem.frames], case.state.T_map_camera, pivots,
         reference.Map(case.state.heights, case.grid.origin, case.grid.spacing),
         along_ray=loss.along_ray, slope=loss.slope, cap=loss.cap, c=loss.robust_c,
         charge=loss.charge, smoothing=loss.smoothing, smooth=case.smooth,
@@ -93,7 +94,7 @@ def test_paper_in_euler_angles_takes_the_same_step() -> None:
     grid = reference.Map(D, case.grid.origin, case.grid.spacing)
     for i, frame in enumerate(case.problem.frames):
         euler = Rotation.from_matrix(T[i, :3, :3]).as_euler("ZYX")
-        for *p, own, share in frame.points.astype(float):
+        for *p, own, share in rows_of(frame):
             found = reference.vertical(np.array(p), T[i], np.zeros(3), grid)
             if found is None or share == 0:
                 continue

@@ -126,8 +126,8 @@ def test_points_at_a_step_are_left_out_and_no_others() -> None:
     heights = np.tile(np.where(x > 0.05, 0.1, 0.3 * x), (45, 1))
     kept = without_bends(problem, grid, heights, T)
     for frame, pose in zip(kept.frames, T, strict=True):
-        at = frame.points[:, :3] @ pose[0, :3] + pose[0, 3]
-        share = frame.points[:, 4]
+        at = frame.points @ pose[0, :3] + pose[0, 3]
+        share = frame.share
         assert not share[np.abs(at - 0.05) < 0.02].any()
         assert (share[np.abs(at - 0.05) > 0.06] == 1.0).all()
 

@@ -16,9 +16,10 @@ def test_jacobians_of_slope_noise_against_plain_numpy() -> None:
     rng = np.random.default_rng(1)
     spacing, origin = 0.1, np.array([-1.0, -1.0])
     nodes, noise = np.zeros((21, 21, 3)), rng.normal(size=(21, 21, 3))
-    points = np.ones((50, 5), np.float32)
-    points[:, :2], points[:, 2] = rng.uniform(-0.5, 0.5, (50, 2)), 1.0
-    points[:, 3], points[:, 4] = rng.uniform(0.5, 2.0, 50), rng.uniform(0.2, 1.0, 50)
+    points = np.ones((50, 3), np.float32)
+    points[:, :2] = rng.uniform(-0.5, 0.5, (50, 2))
+    inverse_noise = rng.uniform(0.5, 2.0, 50).astype(np.float32)
+    share = rng.uniform(0.2, 1.0, 50).astype(np.float32)
     R, t = np.diag([1.0, -1.0, -1.0]), np.array([0.03, -0.02, 1.0])
     arm, weights = np.array([0.1, 0.2, 0.9]), rng.uniform(0.1, 1.0, 50).astype(np.float32)
     A, B = np.zeros((6, 6)), np.zeros((21, 21, 6))
@@ -26,12 +27,13 @@ def test_jacobians_of_slope_noise_against_plain_numpy() -> None:
     kernels.feet(points, R, t, origin, spacing, nodes, False, False, 1.0, 0.2, rows, cells)
     feet = Feet(rows, cells)
     probes.slope_noise(
-        points, feet.on, cells, feet.fractions, feet.arms, feet.norm2, arm, weights, noise,
-        A, B, 0, 0,
+        inverse_noise, share, feet.on, cells, feet.fractions, feet.arms, feet.norm2, arm, weights,
+        noise, A, B, 0, 0,
     )  # fmt: skip
     expected, coupled = np.zeros((6, 6)), np.zeros((21, 21, 6))
-    for p, psi in zip(points.astype(float), weights.astype(float), strict=True):
-        q = R @ p[:3]
+    each = share.astype(float) * weights * inverse_noise.astype(float) ** 2
+    for p, w in zip(points.astype(float), each, strict=True):
+        q = R @ p
         u, v = (q[:2] + t[:2] - origin) / spacing
         x, y = int(u), int(v)
         shares = {
@@ -42,7 +44,6 @@ def test_jacobians_of_slope_noise_against_plain_numpy() -> None:
         gx, gy = sum(h * noise[node][1:] for node, h in shares.items())
         lever, slope = q + arm, np.array([-gx, -gy, 0.0])
         j = np.concatenate([slope, np.cross(lever, slope)])
-        w = p[4] * psi * p[3] ** 2
         expected += w * np.outer(j, j)
         for node, h in shares.items():
             coupled[node] -= w * h * j
