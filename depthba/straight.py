@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from depthba import se3
+from depthba.compiling import kernel
 from depthba.errors import OutOfReach
 from depthba.kinematics import DhArm
 
@@ -72,7 +72,7 @@ def straight(arm: DhArm, q0: ArrayLike, T_base_flange: ArrayLike) -> Line:
     return Line(length, angle, joints)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def flange(links: Array, q: Array) -> Array:
     """``T_base_flange`` (4, 4) at joints (n,); `links` (n, 4, 4) are `DhArm.links`."""
     frames = np.empty((len(q) + 1, 4, 4))
@@ -81,7 +81,7 @@ def flange(links: Array, q: Array) -> Array:
     return T
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _frames(links: Array, q: Array, T: Array) -> None:
     """Fill the frames T (n + 1, 4, 4), the base first."""
     for i in range(4):
@@ -101,7 +101,7 @@ def _frames(links: Array, q: Array, T: Array) -> None:
             T[k + 1, 3, j] = T[0, 3, j]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _follow(
     links: Array, lower: Array, upper: Array, T_line: Array, joints: Array
 ) -> tuple[int, int]:
@@ -119,7 +119,7 @@ def _follow(
     return len(T_line) - 1, _DONE
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _solve(links: Array, T_goal: Array, q: Array) -> bool:
     """Bring `q` (n,) to the goal; whether it came there."""
     n = len(q)
@@ -153,7 +153,7 @@ def _solve(links: Array, T_goal: Array, q: Array) -> bool:
     return False
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _error(T_goal: Array, T: Array, e: Array) -> float:
     """Fill e (6,), m and rad; its largest component."""
     for i in range(3):
@@ -169,7 +169,7 @@ def _error(T_goal: Array, T: Array, e: Array) -> float:
     return worst
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _axis(T_joint: Array, T_flange: Array, J: Array, k: int) -> None:
     """Fill column k of the Jacobian (6, n): ``[z x (p_flange - p), z]``."""
     for i in range(3):
@@ -179,7 +179,7 @@ def _axis(T_joint: Array, T_flange: Array, J: Array, k: int) -> None:
         J[i + 3, k] = T_joint[i, 2]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _solve_symmetric(A: Array, x: Array) -> None:
     """Solve ``A x = b`` in place, x (m,) is b before; A (m, m), positive definite, is spent."""
     m = len(x)

@@ -4,15 +4,15 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.compiling import kernel
 from depthba.optimiser.linearise import Footprint, Linearisation
 from depthba.optimiser.workers import Workers
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _spread(values, x0, y0, v, out, first, last):
     """Add ``B^T v`` of one frame to the rows ``first`` to ``last`` of the field ``out``."""
     for y in range(max(first - y0, 0), min(last - y0, values.shape[0])):
@@ -23,7 +23,7 @@ def _spread(values, x0, y0, v, out, first, last):
             )
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _gather(values, x0, y0, field, out):
     """Add ``B field`` of one frame to ``out`` (6,)."""
     for y in range(values.shape[0]):

@@ -19,39 +19,44 @@ class Feet:
     """What :func:`depthba.optimiser.kernels.feet` finds of n points."""
 
     rows: NDArray[np.float64]
-    """(ROWS, n)."""
+    """(ROWS, n), in the order that they have in a chunk."""
     cells: NDArray[np.int32]
     """(2, n), x and y of the cell."""
 
     @property
     def on(self) -> NDArray[np.float64]:
         """(n,), 1 on the map, else 0."""
-        return np.asarray(self.rows[kernels.ON])
+        return self._rows(kernels.ON).ravel()
 
     @property
     def fractions(self) -> NDArray[np.float64]:
         """(2, n), x and y within the cell."""
-        return np.asarray(self.rows[kernels.FRACTION_X : kernels.FRACTION_Y + 1])
+        return self._rows(kernels.FRACTION_X, 2)
 
     @property
     def arms(self) -> NDArray[np.float64]:
         """(3, n), from the sensor's centre, map axes, m."""
-        return np.asarray(self.rows[kernels.ARM_X : kernels.ARM_Z + 1])
+        return self._rows(kernels.ARM_X, 3)
 
     @property
     def residuals(self) -> NDArray[np.float64]:
         """(n,); over the root of ``norm2`` a distance in metres."""
-        return np.asarray(self.rows[kernels.RESIDUAL])
+        return self._rows(kernels.RESIDUAL).ravel()
 
     @property
     def norm2(self) -> NDArray[np.float64]:
         """(n,)."""
-        return np.asarray(self.rows[kernels.NORM2])
+        return self._rows(kernels.NORM2).ravel()
 
     @property
     def slopes(self) -> NDArray[np.float64]:
         """(2, n), the map's gradient."""
-        return np.asarray(self.rows[kernels.SLOPE_X : kernels.SLOPE_Y + 1])
+        return self._rows(kernels.SLOPE_X, 2)
+
+    def _rows(self, begin: int, count: int = 1) -> NDArray[np.float64]:
+        """Return the rows that begin at a place of a chunk."""
+        first = begin // kernels.CHUNK
+        return self.rows[first : first + count]
 
 
 class Ground:

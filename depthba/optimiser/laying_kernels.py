@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 
+from depthba.compiling import kernel
 
-@nb.njit(cache=True, nogil=True)
+
+@kernel
 def to_map(points, frame, T, out):
     """Bring points (n, 3) of the given frames (n,) into the map frame."""
     for i in range(len(points)):
@@ -21,7 +22,7 @@ def to_map(points, frame, T, out):
             )
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def extent(x, these, side, least, most):
     """Fill ``least`` and ``most`` (3,) with the first and the last voxel of some points."""
     for a in range(3):
@@ -33,7 +34,7 @@ def extent(x, these, side, least, most):
             most[a] = max(most[a], c)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def number(x, these, side, least, spans, out):
     """Write to ``out`` the number of each point's voxel in a box of ``spans`` (3,) voxels."""
     for k in range(len(these)):
@@ -44,7 +45,7 @@ def number(x, these, side, least, spans, out):
         out[k] = n
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def sort_by(bins, count, order):
     """Write to ``order`` (n,) the points sorted by bin; the sort is stable."""
     at = np.zeros(count + 1, np.int64)
@@ -57,7 +58,7 @@ def sort_by(bins, count, order):
         at[bins[i]] += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def moments(order, begins, x, w, weight, mean, spread):
     """Fill weight, mean and scatter of every run of points, each of which ends where one begins."""
     for j in range(len(weight)):

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 
+from depthba.compiling import kernel
 
-@nb.njit(cache=True, nogil=True)
+
+@kernel
 def nodal_gradients(heights, spacing, nodes):
     """Fill ``nodes`` (ny, nx, 3) with heights and central differences, one-sided at the border."""
     nodal_rows(heights, spacing, nodes, 0, heights.shape[0])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def nodal_rows(heights, spacing, nodes, first, last):
     """Do what :func:`nodal_gradients` does, for the rows ``first`` to ``last`` alone."""
     ny, nx = heights.shape
@@ -31,7 +32,7 @@ def nodal_rows(heights, spacing, nodes, first, last):
             nodes[y, x, 2] = (heights[y1, x] - heights[y0, x]) * across
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def collect(
     totals, heights, smooth, weight, first, last, own, right, up, up_right, up_left, gradient
 ):  # fmt: skip
@@ -85,7 +86,7 @@ def collect(
     return cost
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def splat(points, R, t, origin, spacing, total, count):
     """Add the points' heights to the nodes nearest to them: their sum and number, each (ny, nx)."""
     ny, nx = total.shape
@@ -101,7 +102,7 @@ def splat(points, R, t, origin, spacing, total, count):
             count[y, x] += 1.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def look_up(points, R, t, origin, spacing, field, out):
     """Write to ``out`` (n,) the field's value at the node nearest to each point; 1 off the grid."""
     ny, nx = field.shape
@@ -114,7 +115,7 @@ def look_up(points, R, t, origin, spacing, field, out):
         out[k] = field[y, x] if 0 <= x < nx and 0 <= y < ny else 1.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def splat_residuals(points, R, t, origin, spacing, nodes, total, squares, count):
     """Add the points' vertical distances from the map to the nodes nearest to them.
 

@@ -7,10 +7,9 @@ take patches ``first`` to ``last``, so that they can be dealt out over threads.
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 
-from depthba.optimiser.kernels import FAST
+from depthba.compiling import fast, kernel
 from depthba.optimiser.patch_points import (
     COUNTS,
     NORM2,
@@ -34,7 +33,7 @@ from depthba.optimiser.patch_points import (
 POSE, SURFACE, ERROR, COLUMNS = 0, 6, 12, 16
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def _charge(n, square, s, out):
     """Return what the points cost, m^2; how far they lie off goes to ``out``."""
     weight, norm2, off = s[WEIGHT], s[NORM2], s[OFF]
@@ -46,7 +45,7 @@ def _charge(n, square, s, out):
     return total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fit(
     first, last, points, weights, ends, views, Q, o, reach, stiff, rays, square, rounds, surface,
     off,
@@ -98,7 +97,7 @@ def fit(
     return total
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def _view_sums(first, last, pivot, s, z, Z):
     """Sum ``w z_a z_c`` over a view's points, a of the pose: Z (6, COLUMNS)."""
     Z[:] = 0.0
@@ -113,7 +112,7 @@ def _view_sums(first, last, pivot, s, z, Z):
                 Z[a, c] += t * z[c]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def gather(
     first, last, points, weights, ends, views, frame, Q, o, pivot, axes, reach, stiff, rays,
     surface, square, A, g,
@@ -173,7 +172,7 @@ def gather(
                         A[f, a, h, c] -= t
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def scores(
     first, last, points, weights, ends, views, frame, Q, o, pivot, axes, reach, stiff, rays,
     surface, square, groups, out,
@@ -223,7 +222,7 @@ def scores(
                             to[f, a] -= wr * t
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def medians(ends, off, out):
     """Write to ``out`` (k,) the median size of the values of each run; one run ends, one begins."""
     most = 0

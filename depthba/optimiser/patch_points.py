@@ -13,10 +13,9 @@ The points of a patch go through together, one stage for all of them after the o
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 
-from depthba.optimiser.kernels import FAST
+from depthba.compiling import fast, inlined, kernel
 
 TERMS = 6
 """Coefficients of a surface."""
@@ -31,7 +30,7 @@ SLOPE_U, SLOPE_V, NORM2, OFF, COUNTS = range(10, 15)
 ROWS = 15
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def room(first, last, ends, views):
     """Return memory for the points of any of the patches."""
     most = 0
@@ -40,7 +39,7 @@ def room(first, last, ends, views):
     return np.empty((ROWS, most))
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def _turn_view(points, weights, Q, o, rays, s, at):
     """Bring the points of a view into the axes of their patch, to columns from ``at`` on."""
     q00, q01, q02 = Q[0, 0], Q[0, 1], Q[0, 2]
@@ -65,7 +64,7 @@ def _turn_view(points, weights, Q, o, rays, s, at):
             a2[i] *= shorter
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def place(k, points, weights, ends, views, Q, o, rays, s):
     """Bring the points of a patch into its axes; return how many they are."""
     begin = ends[views[k]]
@@ -75,7 +74,7 @@ def place(k, points, weights, ends, views, Q, o, rays, s):
     return ends[views[k + 1]] - begin
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def meet(n, q, rays, reach, s):
     """Walk the points of a patch to its surface: feet, slopes there, norms, how far they lie off.
 
@@ -124,7 +123,7 @@ def meet(n, q, rays, reach, s):
         off[i] = e - off[i] * cosine
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def weigh(n, square, s):
     """Say how much points count: Geman-McClure of squared scale, m^2; 0: no robust loss."""
     weight, norm2, off, counts = s[WEIGHT], s[NORM2], s[OFF], s[COUNTS]
@@ -138,7 +137,7 @@ def weigh(n, square, s):
         counts[i] = w * share * share
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast
 def surface_sums(n, s, M, b):
     """Sum what points say of a surface: M (6, 6), its lower triangle, and b (6,).
 
@@ -180,7 +179,7 @@ def surface_sums(n, s, M, b):
     b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _factor(M, L):
     """Cholesky factor of a positive definite (6, 6) matrix; only its lower triangle is read."""
     for i in range(6):
@@ -191,7 +190,7 @@ def _factor(M, L):
             L[i, j] = np.sqrt(max(s, 1e-300)) if i == j else s / L[j, j]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def forward(L, b):
     """Solve ``L x = b`` in place."""
     for i in range(6):
@@ -200,7 +199,7 @@ def forward(L, b):
         b[i] /= L[i, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def backward(L, b):
     """Solve ``L^T x = b`` in place."""
     for i in range(5, -1, -1):
@@ -209,7 +208,7 @@ def backward(L, b):
         b[i] /= L[i, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def firm(M, stiff, L):
     """Factor a surface's normal matrix; a term that no point holds is held by next to nothing."""
     for j in range(6):
@@ -219,7 +218,7 @@ def firm(M, stiff, L):
     _factor(M, L)
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inlined
 def by_pose(J, i, s, pivot):
     """Derivative at a foot by a shift and a turn of the frame about its pivot, in patch axes."""
     n1, n2 = s[SLOPE_U, i], s[SLOPE_V, i]
@@ -228,7 +227,7 @@ def by_pose(J, i, s, pivot):
     J[3], J[4], J[5] = a1 * n2 - a2 * n1, a2 - a0 * n2, a0 * n1 - a1
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inlined
 def by_surface(phi, i, s):
     """Derivative at a foot by the surface's coefficients, its sign turned."""
     u, v = s[FOOT_U, i], s[FOOT_V, i]
@@ -236,7 +235,7 @@ def by_surface(phi, i, s):
     phi[3], phi[4], phi[5] = u * u, u * v, v * v
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def into_map(H, V, out):
     """Columns of H (r, 6) from patch axes to map axes."""
     for r in range(H.shape[0]):
@@ -248,7 +247,7 @@ def into_map(H, V, out):
                 out[r, 3 * half + a] = s
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def local(frame, views, axes, centre, T, Q, o):
     """Fill Q (m, 3, 3) and o (m, 3): a point p of a view lies at ``Q p + o`` in its patch."""
     for k in range(len(views) - 1):

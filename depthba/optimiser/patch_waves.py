@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.compiling import inlined, kernel
 from depthba.optimiser.patch_points import (
     COUNTS,
     OFF,
@@ -121,13 +121,13 @@ def _waves(patches: Patches, waves: Waves, run: tuple[int, int]) -> NDArray[np.f
     return waves.at(patches.points[first:last])
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _cosine(i, s):
     """Return the change of a point's distance from the surface with its range."""
     return s[RAY_0, i] + s[SLOPE_U, i] * s[RAY_1, i] + s[SLOPE_V, i] * s[RAY_2, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _gather(
     first, last, points, weights, ends, views, frame, Q, o, pivot, axes, reach, stiff, rays,
     surface, square, waves, own, cross, gradient, surfaces,
@@ -153,7 +153,7 @@ def _gather(
             _couple(i, j, s, here, pivot[view], axes[k], surfaces[k], cross[frame[view]])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _sum(n, s, waves, own, gradient, W):
     """Add a patch's points to ``own`` and ``gradient``; W (6, m) gets surface against pattern."""
     phi, m = np.zeros(6), len(gradient)
@@ -174,7 +174,7 @@ def _sum(n, s, waves, own, gradient, W):
                 W[a, j] += t * at[j]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _eliminate(L, W, b, X, own, gradient):
     """Take the surface out, whose factor is L and gradient b; X (6, m) gets how it follows."""
     m = len(gradient)
@@ -193,7 +193,7 @@ def _eliminate(L, W, b, X, own, gradient):
             own[j, other] -= t
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _couple(first, last, s, waves, pivot, V, X, cross):
     """Add what a view's points say of its pose and the pattern at once to ``cross`` (6, m)."""
     phi, J, row, P = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, 6))
@@ -218,7 +218,7 @@ def _couple(first, last, s, waves, pivot, V, X, cross):
             cross[a, j] += t
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _score(
     first, last, points, weights, ends, views, Q, o, reach, rays, surface, square, waves,
     surfaces, groups, out,

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from depthba.compiling import kernel
 from depthba.optimiser import dense
 from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Feet, Ground
@@ -301,7 +301,7 @@ def _jacobian(feet: Feet, arm: Array) -> Array:
     return np.stack([-gx, -gy, np.ones_like(gx), ly + lz * gy, -lz * gx - lx, -lx * gy + ly * gx])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _spread(cells, fractions, pulls, waves, fields):
     """Add every point's pull times its waves (n, m) to its cell's nodes of ``fields``."""
     m = waves.shape[1]
@@ -318,7 +318,7 @@ def _spread(cells, fractions, pulls, waves, fields):
                 node[j] += e * waves[k, j]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _scores(cells, fractions, pulls, change, waves, answers, groups, scores):
     """Add what every point adds to the pattern's reduced gradient to ``scores``, by its groups."""
     m = waves.shape[1]

@@ -6,17 +6,18 @@ All take where a frame's points meet the map, as :class:`depthba.optimiser.feet.
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 
+from depthba.compiling import inlined, kernel
 
-@nb.njit(cache=True, nogil=True, inline="always")
+
+@inlined
 def _shares(a, b):
     """Shares of a cell's four nodes at a fraction of it."""
     return (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def contributions(
     inverse_noise, shares, on, arms, slopes, norm2, residuals, arm, weights, groups, pulls, scores
 ):  # fmt: skip
@@ -44,7 +45,7 @@ def contributions(
             s[5] += wr * (-lx * gy + ly * gx)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def answered(cells, fractions, pulls, groups, answer, left, low, scores):
     """Add what the map's answer makes of the points' contributions to another frame's ``scores``.
 
@@ -65,7 +66,7 @@ def answered(cells, fractions, pulls, groups, answer, left, low, scores):
                 scores[kind, groups[kind, k], m] += v
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def noise_gradient(
     inverse_noise, shares, on, cells, fractions, norm2, weights, draws, gradient
 ):  # fmt: skip
@@ -82,7 +83,7 @@ def noise_gradient(
         gradient[y + 1, x + 1] -= h11 * e
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def slope_noise(
     inverse_noise, shares, on, cells, fractions, arms, norm2, arm, weights, noise, A, B, bx, by
 ):  # fmt: skip
@@ -117,7 +118,7 @@ def slope_noise(
                 node[n] -= h[m] * w * j[n]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def leverages(inverse_noise, shares, on, cells, fractions, norm2, weights, own, out):
     """Write to ``out`` (n,) how much every point pulls the map to itself.
 

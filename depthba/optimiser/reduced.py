@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from depthba.compiling import kernel
 from depthba.optimiser.coupling import meet
 from depthba.optimiser.linearise import Footprint, Linearisation
 from depthba.optimiser.stencil import MapSolver
@@ -23,7 +23,7 @@ REACH = 12
 DIRECT = 0.15
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _lumped_block(B, bx, by, E, ex, ey, bound, out):
     """Add ``B diag(bound)^-1 E^T`` over the nodes that both footprints cover to ``out`` (6, 6)."""
     y0, y1 = max(by, ey), min(by + B.shape[0], ey + E.shape[0])
@@ -39,7 +39,7 @@ def _lumped_block(B, bx, by, E, ex, ey, bound, out):
                         out[m, k] += v * right[k]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _product(B, bx, by, E, ex, ey, out):
     """Add ``B E^T`` over the nodes that both windows cover to ``out`` (6, 6)."""
     y0, y1 = max(by, ey), min(by + B.shape[0], ey + E.shape[0])

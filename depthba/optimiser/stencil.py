@@ -14,11 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from depthba.compiling import fast, inlined, kernel
 from depthba.optimiser.workers import Workers
 
 Field = NDArray[np.float64]
@@ -100,7 +100,7 @@ class Stencil:
         return sp.csc_matrix(upper + upper.T + sp.diags(self.own.ravel()))
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _border(own, right, up, up_right, up_left, v, y, x):
     """Return the product at a node on the border of the grid."""
     ny, nx = own.shape
@@ -124,7 +124,7 @@ def _border(own, right, up, up_right, up_left, v, y, x):
     return total
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@fast
 def _times(own, right, up, up_right, up_left, v, out):
     ny, nx = own.shape
     for x in range(nx):
@@ -228,14 +228,14 @@ class MapSolver:
         return scale * out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _reciprocal_root(own, scale, first, last):
     for y in range(first, last):
         for x in range(own.shape[1]):
             scale[y, x] = 1.0 / np.sqrt(own[y, x])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _scaled(scale, right, up, up_right, up_left, out, first, last):
     ny, nx = scale.shape
     for y in range(first, last):
@@ -250,7 +250,7 @@ def _scaled(scale, right, up, up_right, up_left, out, first, last):
                     out[3, y + 1, x + 1] = scale[y, x + 1] * up_left[y, x] * scale[y + 1, x]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _begin(b, scale, r, sums, first, last):
     """Scale the right-hand side into ``r``; its squared norm by rows goes to ``sums``."""
     for y in range(first, last):
@@ -262,7 +262,7 @@ def _begin(b, scale, r, sums, first, last):
         sums[y] = total
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@fast
 def _next_row(r, beta, p, y, out):
     for x in range(r.shape[1]):
         out[x + 1] = r[y, x] + beta * p[y + 1, x + 1]
@@ -270,7 +270,7 @@ def _next_row(r, beta, p, y, out):
 
 # The product with a row goes in two: of more arrays at once the compiler does not prove that they
 # lie apart, and gives up on vector instructions.
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@fast
 def _straight(right, up, up_below, here, above, below, q):
     for x in range(q.shape[0]):
         q[x] = (
@@ -282,7 +282,7 @@ def _straight(right, up, up_below, here, above, below, q):
         )
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@fast
 def _across(across, across_below, back, back_below, here, above, below, q):
     """Add the diagonal neighbours to ``q``; return ``here . q``."""
     total = q.dtype.type(0.0)
@@ -298,7 +298,7 @@ def _across(across, across_below, back, back_below, here, above, below, q):
     return total
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@fast
 def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
     """Take the next direction ``after = r + beta p`` and ``q``, its product with the matrix.
 
@@ -333,7 +333,7 @@ def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
         sums[y] = total
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@fast
 def _advance(alpha, p, q, x, r, sums, first, last):
     """Step along ``p``: ``x += alpha p``, ``r -= alpha q``; ``r . r`` by rows goes to ``sums``."""
     alpha = r.dtype.type(alpha)
@@ -347,7 +347,7 @@ def _advance(alpha, p, q, x, r, sums, first, last):
         sums[y] = total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _conjugate_gradients(couplings, y0, x0, b, x, tolerance, limit):
     h, w = b.shape
     r = b.astype(x.dtype)

@@ -7,10 +7,11 @@ pairwise start itself correlates height maps, which also works where a surface h
 from __future__ import annotations
 
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from depthba.compiling import kernel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -86,7 +87,7 @@ def _neighbours(
     return np.where(wrong, -1, index).astype(np.int64), np.where(wrong, 0.0, distance)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _simple(points, normal, index):
     """Histogram each point's angles with its neighbours: alpha, phi, theta (eq. 1 there)."""
     out = np.zeros((len(points), LENGTH))
@@ -122,7 +123,7 @@ def _simple(points, normal, index):
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _blended(simple, index, distance):
     """Add the neighbours' histograms, weighted by the inverse of their distance (eq. 2 there)."""
     out = np.zeros_like(simple)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from depthba.compiling import kernel
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +95,7 @@ def _plane(raster: Raster) -> Floats:
     return np.asarray(a + b * x[None, :] + c * y[:, None])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _splat(points, cell, sums, counts):  # type: ignore[no-untyped-def]
     side = sums.shape[0]
     half = side // 2

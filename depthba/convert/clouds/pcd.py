@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from depthba import bounds, se3
+from depthba.compiling import kernel
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -162,7 +162,7 @@ def _interleaved(
     return out.tobytes()
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     """Unpack LZF: literals, and references back into what is out already; -1 where it is broken.
 
