@@ -11,6 +11,7 @@ import numpy as np
 
 from depthba.compiling import fast, kernel
 from depthba.optimiser.patch_points import (
+    CHUNK,
     COUNTS,
     NORM2,
     OFF,
@@ -24,6 +25,7 @@ from depthba.optimiser.patch_points import (
     meet,
     place,
     room,
+    spot,
     surface_sums,
     weigh,
 )
@@ -33,15 +35,23 @@ from depthba.optimiser.patch_points import (
 POSE, SURFACE, ERROR, COLUMNS = 0, 6, 12, 16
 
 
-@fast
+@kernel
 def _charge(n, square, s, out):
     """Return what the points cost, m^2; how far they lie off goes to ``out``."""
-    weight, norm2, off = s[WEIGHT], s[NORM2], s[OFF]
     total = 0.0
-    for i in range(n):
-        e = np.sqrt(weight[i] / norm2[i]) * off[i]
+    for first in range(0, n, CHUNK):
+        last = min(first + CHUNK, n)
+        total += _charge_chunk(square, s[spot(first) :], out[first:last])
+    return total
+
+
+@fast
+def _charge_chunk(square, s, out):
+    total = 0.0
+    for i in range(len(out)):
+        e = np.sqrt(s[WEIGHT + i] / s[NORM2 + i]) * s[OFF + i]
         out[i] = e
-        total += e * e if square == 0.0 else square * e * e / (square + e * e)
+        total += square * e * e / (square + e * e) if square > 0.0 else e * e
     return total
 
 
@@ -102,10 +112,11 @@ def _view_sums(first, last, pivot, s, z, Z):
     """Sum ``w z_a z_c`` over a view's points, a of the pose: Z (6, COLUMNS)."""
     Z[:] = 0.0
     for i in range(first, last):
-        by_pose(z[POSE:SURFACE], i, s, pivot)
-        by_surface(z[SURFACE:ERROR], i, s)
-        z[ERROR] = s[OFF, i]
-        w = s[COUNTS, i]
+        at = spot(i)
+        by_pose(z[POSE:SURFACE], at, s, pivot)
+        by_surface(z[SURFACE:ERROR], at, s)
+        z[ERROR] = s[OFF + at]
+        w = s[COUNTS + at]
         for a in range(6):
             t = w * z[a]
             for c in range(COLUMNS):
@@ -205,10 +216,11 @@ def scores(
                 backward(L, H[x, a])
         for m in range(views[k], views[k + 1]):
             for i in range(ends[m], ends[m + 1]):
-                by_pose(J, i - begin, s, pivot[m])
-                by_surface(phi, i - begin, s)
+                at = spot(i - begin)
+                by_pose(J, at, s, pivot[m])
+                by_surface(phi, at, s)
                 into_map(J.reshape(1, 6), V, row)
-                wr = s[COUNTS, i - begin] * s[OFF, i - begin]
+                wr = s[COUNTS + at] * s[OFF + at]
                 for kind in range(groups.shape[1]):
                     to = out[kind, groups[i, kind]]
                     for a in range(6):

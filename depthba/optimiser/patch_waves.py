@@ -32,6 +32,7 @@ from depthba.optimiser.patch_points import (
     meet,
     place,
     room,
+    spot,
     surface_sums,
     weigh,
 )
@@ -122,9 +123,9 @@ def _waves(patches: Patches, waves: Waves, run: tuple[int, int]) -> NDArray[np.f
 
 
 @inlined
-def _cosine(i, s):
+def _cosine(at, s):
     """Return the change of a point's distance from the surface with its range."""
-    return s[RAY_0, i] + s[SLOPE_U, i] * s[RAY_1, i] + s[SLOPE_V, i] * s[RAY_2, i]
+    return s[RAY_0 + at] + s[SLOPE_U + at] * s[RAY_1 + at] + s[SLOPE_V + at] * s[RAY_2 + at]
 
 
 @kernel
@@ -159,19 +160,20 @@ def _sum(n, s, waves, own, gradient, W):
     phi, m = np.zeros(6), len(gradient)
     W[:] = 0.0
     for i in range(n):
-        by_surface(phi, i, s)
-        c, at = _cosine(i, s), waves[i]
-        pull = s[COUNTS, i] * c
-        e = pull * s[OFF, i]
+        at, wave = spot(i), waves[i]
+        by_surface(phi, at, s)
+        c = _cosine(at, s)
+        pull = s[COUNTS + at] * c
+        e = pull * s[OFF + at]
         for j in range(m):
-            gradient[j] -= e * at[j]
-            t = pull * c * at[j]
+            gradient[j] -= e * wave[j]
+            t = pull * c * wave[j]
             for other in range(j + 1):
-                own[j, other] += t * at[other]
+                own[j, other] += t * wave[other]
         for a in range(6):
             t = pull * phi[a]
             for j in range(m):
-                W[a, j] += t * at[j]
+                W[a, j] += t * wave[j]
 
 
 @kernel
@@ -199,11 +201,12 @@ def _couple(first, last, s, waves, pivot, V, X, cross):
     phi, J, row, P = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, 6))
     m = waves.shape[1]
     for i in range(first, last):
-        by_pose(J, i, s, pivot)
-        by_surface(phi, i, s)
+        at = spot(i)
+        by_pose(J, at, s, pivot)
+        by_surface(phi, at, s)
         into_map(J.reshape(1, 6), V, row)
-        w = s[COUNTS, i]
-        pull = w * _cosine(i, s)
+        w = s[COUNTS + at]
+        pull = w * _cosine(at, s)
         for a in range(6):
             t = pull * row[0, a]
             for j in range(m):
@@ -233,9 +236,10 @@ def _score(
         weigh(n, square, s)
         begin = ends[views[k]]
         for i in range(n):
-            by_surface(phi, i, s)
-            c = _cosine(i, s)
-            wr = s[COUNTS, i] * s[OFF, i]
+            at = spot(i)
+            by_surface(phi, at, s)
+            c = _cosine(at, s)
+            wr = s[COUNTS + at] * s[OFF + at]
             for j in range(m):
                 t = -c * waves[begin - start + i, j]
                 for a in range(6):
