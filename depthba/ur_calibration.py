@@ -64,7 +64,7 @@ def _numbers(value: object, name: str, path: Path, count: int) -> list[float]:
     try:
         # YAML 1.1 takes 3e-05 for a word.
         numbers = [float(one) for one in value] if isinstance(value, list) else []
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
         raise OptionError(f"calibration {path}: {name} {value}: expected {count} numbers, m or rad")

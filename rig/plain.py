@@ -42,7 +42,7 @@ def from_plain(kind: Any, values: Mapping[str, Any], who: str) -> Any:
     for name, value in values.items():
         try:
             converted[name] = _converted(value, hints[name], f"{who}: {name}")
-        except ValueError:
+        except (ValueError, OverflowError):
             hint = getattr(hints[name], "__name__", None) if isinstance(hints[name], type) else None
             expected = hint or str(hints[name]).replace("typing.", "")
             raise OptionError(f"{who}: option {name!r} is {value!r}, expected {expected}") from None
@@ -50,13 +50,13 @@ def from_plain(kind: Any, values: Mapping[str, Any], who: str) -> Any:
 
 
 def _converted(value: Any, hint: Any, who: str) -> Any:
-    """Return a value as its type hint wants it; ValueError where it does not fit."""
+    """Return a value as its type hint wants it; ValueError, OverflowError where it does not fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         for choice in arguments:
             try:
                 return _converted(value, choice, who)
-            except ValueError:
+            except (ValueError, OverflowError):
                 continue
         raise ValueError
     if origin is Literal:

@@ -22,7 +22,8 @@ from depthba.optimiser.problem import Problem
 AGAIN = 12
 # Residuals more alike than this many times what independent ones would be are the map's to blame
 # for, too, which has one height per node. Patches beside it then count so many times, from one
-# settling to the next: less before the poses have settled, since patches hold what they tie.
+# settling to the next, for as long as that leaves residuals less alike: less before the poses have
+# settled, since patches hold what they tie.
 ALIKE = 1.5
 EMPHASIS = (1.0, 1.0, 2.0, 4.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
@@ -39,6 +40,8 @@ CLEARED = 0.15
 # Any must leave residuals whose inflation is below this share: relief that a coarse map cannot hold
 # mimics one that grows with every step, and the inflation with it.
 GROWN = 1.25
+# And residuals that are at most so many times as large: what is taken off explains them.
+LARGER = 1.1
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
     course = _Course()
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
-        if course.refuted(there):
+        if course.refuted(end, there):
             end = course.back(engine)
             there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
         further = course.further(engine, end, there)
@@ -131,15 +134,20 @@ class _Course:
     before: _Before | None = None
     trail: Trail = field(default_factory=Trail)
     emphasis: int = 0
+    alike: float = np.inf
+    """How much alike residuals were when patches were last made to count more."""
 
-    def refuted(self, there: Known) -> bool:
-        """Whether the pattern that has been taken off leaves residuals too much alike."""
+    def refuted(self, end: End, there: Known) -> bool:
+        """Whether the pattern that was taken off leaves residuals too large, or too much alike."""
         before = self.before
-        return before is not None and there.inflation > before.share * before.inflation
+        if before is None:
+            return False
+        larger = end.outcome.sigma > LARGER * before.end.outcome.sigma
+        return larger or there.inflation > before.share * before.inflation
 
     def back(self, engine: Engine) -> End:
         """Put all points back to where they were measured; return where that was."""
-        before, self.before, self.emphasis = self.before, None, 0
+        before, self.before, self.emphasis, self.alike = self.before, None, 0, np.inf
         assert before is not None
         engine.problem, engine.bend, engine.plain = before.problem, None, True
         engine.refused_pattern, engine.emphasis = before.size, EMPHASIS[0]
@@ -152,7 +160,7 @@ class _Course:
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
         # a pattern may be what keeps the poses from settling
-        alike = level.tied is not None and known.overall > ALIKE
+        alike = level.tied is not None and ALIKE < known.overall < self.alike
         firmer = alike and self.emphasis < len(EMPHASIS) - 1
         more = firmer or bent or (outcome.converged and (less or finer < level.grid.spacing))
         if engine.clock.over or not more:
@@ -168,7 +176,7 @@ class _Course:
             level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
         if firmer:
-            self.emphasis += 1
+            self.emphasis, self.alike = self.emphasis + 1, known.overall
             engine.emphasis = EMPHASIS[self.emphasis]
         if finer < level.grid.spacing:
             index += 1

@@ -21,6 +21,7 @@ from depthba.convert.reading import Reading
 from depthba.convert.recording import Convention, Format, Recording, SourceFrame, left_out
 from depthba.convert.writing import camera_of, depth_pixels, each, new_folder, write_png
 from depthba.dataset import Dataset
+from depthba.dataset.fields import shown
 from depthba.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -133,15 +134,28 @@ def write(dataset: Dataset, T_world_camera: Array, path: Path) -> None:
 
 def _number(value: dict[str, Any], key: str, default: float, file: Path) -> float:
     found = value.get(key, default)
-    if not isinstance(found, int | float) or not found > 0:
-        raise DatasetError(f"{file}: {key} is {found!r}, expected a number above 0")
-    return float(found)
+    number = _finite(found)
+    if number is None or not number > 0:
+        raise DatasetError(f"{file}: {key} is {shown(found)}, expected a number above 0")
+    return number
 
 
 def _stamp(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DatasetError(f"{where}.timestamp is {value!r}, expected finite seconds")
-    return float(value)
+    seconds = _finite(value)
+    if seconds is None:
+        raise DatasetError(f"{where}.timestamp is {shown(value)}, expected finite seconds")
+    return seconds
+
+
+def _finite(value: Any) -> float | None:
+    """Return a finite number; None where it is none, or an integer that is none as a float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _pose(entry: dict[str, Any], where: str) -> Array:
