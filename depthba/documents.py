@@ -62,34 +62,41 @@ def check_yaml(text: str) -> None:
             more than `MOST_NODES` values.
 
     """
+    # libyaml gives up on some text that Python's own parser, which reads it in the end, takes
+    for loader in (getattr(yaml, "CSafeLoader", yaml.SafeLoader), yaml.SafeLoader):
+        try:
+            _check_events(text, loader)
+            return
+        except TooMuch:
+            raise
+        except yaml.YAMLError:
+            continue
+
+
+def _check_events(text: str, loader: Any) -> None:
     sizes: dict[str, int] = {}
     opened: list[tuple[str | None, int]] = []  # anchor, and the nodes before it
     nodes = 0
-    try:
-        for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-            if isinstance(event, yaml.AliasEvent):
-                if any(anchor == event.anchor for anchor, _ in opened):
-                    raise TooMuch(f"alias {event.anchor!r} lies in what it stands for")
-                nodes += sizes.get(str(event.anchor), 1)
-            elif isinstance(event, yaml.ScalarEvent):
-                nodes += 1
-                if event.anchor is not None:
-                    sizes[event.anchor] = 1
-            elif isinstance(event, yaml.CollectionStartEvent):
-                opened.append((event.anchor, nodes))
-                nodes += 1
-            elif isinstance(event, yaml.CollectionEndEvent):
-                anchor, before = opened.pop()
-                if anchor is not None:
-                    sizes[anchor] = nodes - before
-            if len(opened) > DEEPEST:
-                raise TooMuch(f"nested deeper than {DEEPEST} times")
-            if nodes > MOST_NODES:
-                raise TooMuch(f"its aliases stand for more than {MOST_NODES} values")
-    except TooMuch:
-        raise
-    except yaml.YAMLError:
-        return
+    for event in yaml.parse(text, Loader=loader):
+        if isinstance(event, yaml.AliasEvent):
+            if any(anchor == event.anchor for anchor, _ in opened):
+                raise TooMuch(f"alias {event.anchor!r} lies in what it stands for")
+            nodes += sizes.get(str(event.anchor), 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            nodes += 1
+            if event.anchor is not None:
+                sizes[event.anchor] = 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            opened.append((event.anchor, nodes))
+            nodes += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = opened.pop()
+            if anchor is not None:
+                sizes[anchor] = nodes - before
+        if len(opened) > DEEPEST:
+            raise TooMuch(f"nested deeper than {DEEPEST} times")
+        if nodes > MOST_NODES:
+            raise TooMuch(f"its aliases stand for more than {MOST_NODES} values")
 
 
 def _integer(digits: str) -> int | float:
