@@ -148,9 +148,11 @@ class Engine:
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
                     known = self._correlation(level, state, lin, near)
                 believed = known.inflation if known else 1.0
+                S = near.S
+                del near  # the map's answers, which take more memory than all points
                 final = last and phase == phases(1, self.preset)[-1] and not level.tied
                 temperature, outcome = self._descend(
-                    level, state, lin, near, phase, index, len(levels), known, final
+                    level, state, lin, S, phase, index, len(levels), known, final
                 )
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
@@ -176,9 +178,9 @@ class Engine:
         """
         level = replace(level, tied=tied) if tied else self.patched(level, state, lin)
         phase = phases(1, self.preset)[-1]
-        near = reduced.reduce(lin, self.workers, NEAR, self.free)
+        S = reduced.reduce(lin, self.workers, NEAR, self.free).S
         temperature, outcome = self._descend(
-            level, state, lin, near, phase, index, index + 1, known, True
+            level, state, lin, S, phase, index, index + 1, known, True
         )
         self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature, index, known.inflation if known else 1.0)
@@ -277,14 +279,14 @@ class Engine:
         return replace(at, S=at.S + told)
 
     def _descend(
-        self, level: Level, state: State, lin: Linearisation, near: reduced.Reduction, phase: str,
+        self, level: Level, state: State, lin: Linearisation, S: NDArray[np.float64], phase: str,
         index: int, levels: int, known: certainty.Correlation | None, final: bool,
     ) -> tuple[float, Outcome]:  # fmt: skip
         """Weigh the measured poses by what is known, and solve; return their weight too."""
         temperature = known.inflation * robust_sigma(lin.residuals) ** 2 if known else 0.0
-        sure = self._sure(level, state, lin, near.S, temperature)
+        sure = self._sure(level, state, lin, S, temperature)
         outcome = self._solve(
-            level, state, lin, phase, index, levels, temperature, known, near.S, sure, final
+            level, state, lin, phase, index, levels, temperature, known, S, sure, final
         )
         return temperature, outcome
 

@@ -158,29 +158,25 @@ def answers(
                 )  # fmt: skip
 
             workers.map(spread, halves)
-    solver = MapSolver(lin.C, TOLERANCE)
-
-    def answer(k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        field = fields[:, :, k].astype(np.float64)
-        found = solver.solve_window(field, 0, 0, TOLERANCE)
-        return found.astype(np.float32), (field - lin.C.times(found)).astype(np.float32)
-
-    pairs = workers.map(answer, range(m))
-
-    def stacked(one: tuple[NDArray[np.float32], ...]) -> NDArray[np.float32]:
-        look()
-        return np.stack(one, axis=-1).reshape(-1, m)
-
-    found, left = (stacked(p) for p in zip(*pairs, strict=True))
-    look()
-    # the solves are loose, the product is not: its error is of second order in the tolerance
-    through = fields.reshape(-1, m).T @ found + left.T @ found
-    own -= (through + through.T) / 2
-    gradient -= lin.g_map.ravel().astype(np.float32) @ found
     for i, reply in enumerate(at.answers):
         inner = np.ascontiguousarray(fields[reply.window]).reshape(-1, m)
-        cross[i] -= reply.values.reshape(-1, 6).astype(np.float32).T @ inner
-    return Answers((own + own.T) / 2, cross.reshape(-1, m), gradient, found.reshape(*grid.shape, m))
+        cross[i] -= reply.values.reshape(-1, 6).T @ inner
+    solver, found = MapSolver(lin.C, TOLERANCE), np.empty_like(fields)
+
+    def answer(k: int) -> None:
+        field = fields[:, :, k].astype(np.float64)
+        found[:, :, k] = solver.solve_window(field, 0, 0, TOLERANCE)
+        # the solves are loose, the product is not: with what a solve leaves added to the field its
+        # error is of second order in the tolerance
+        fields[:, :, k] += field - lin.C.times(found[:, :, k].astype(np.float64))
+
+    workers.map(answer, range(m))
+    look()
+    replies = found.reshape(-1, m)
+    through = fields.reshape(-1, m).T @ replies
+    own -= (through + through.T) / 2
+    gradient -= lin.g_map.ravel().astype(np.float32) @ replies
+    return Answers((own + own.T) / 2, cross.reshape(-1, m), gradient, found)
 
 
 def scores(

@@ -117,17 +117,17 @@ def reduce(
     Frames that are not ``free`` (N,) are left out: their rows say nothing.
 
     With X the solutions and R what they leave of B, ``B C^-1 B^T`` is ``X B^T + R X^T`` but for
-    ``R C^-1 R^T``: an error of second order, so a tolerance of 1e-3 leaves 1e-6.
+    ``R C^-1 R^T``: an error of second order, so a tolerance of 1e-3 leaves 1e-6, and single
+    precision is enough for X whatever the tolerance.
     """
     n = len(lin.B)
     solver = MapSolver(lin.C, tolerance)
     spans = windows(lin)
-    stored = np.float32 if tolerance >= 1e-5 else np.float64
 
     def columns(i: int) -> tuple[Footprint, Footprint]:
         foot, (ys, xs) = lin.B[i], spans[i]
         shape = ys.stop - ys.start, xs.stop - xs.start
-        X, R = np.zeros((*shape, 6), stored), np.zeros((*shape, 6), stored)
+        X, R = np.zeros((*shape, 6), np.float32), np.zeros((*shape, 6), np.float32)
         if (free is None or free[i]) and foot.values.any():
             C = lin.C.window(ys, xs)
             inner = foot.y - ys.start, foot.x - xs.start
@@ -135,9 +135,8 @@ def reduce(
             b = np.zeros(shape)
             for m in range(6):
                 b[inner[0] : inner[0] + h, inner[1] : inner[1] + w] = foot.values[..., m]
-                x = solver.solve_window(b, ys.start, xs.start, tolerance)
-                X[..., m] = x
-                R[..., m] = b - C.times(x)
+                X[..., m] = solver.solve_window(b, ys.start, xs.start, tolerance)
+                R[..., m] = b - C.times(X[..., m].astype(float))
         return Footprint(ys.start, xs.start, X), Footprint(ys.start, xs.start, R)
 
     solved = workers.map(columns, range(n))
