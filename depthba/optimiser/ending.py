@@ -28,6 +28,9 @@ ALIKE = 1.5
 EMPHASIS = (1.0, 1.0, 2.0, 4.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
+# It goes on when residuals have come out below this share of what they were where it settled before:
+# frames that had stuck have come loose.
+LOOSE = 0.8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
 BENT = 0.1
 # How much farther than asked for a pattern goes at most, in steps.
@@ -136,6 +139,8 @@ class _Course:
     emphasis: int = 0
     alike: float = np.inf
     """How much alike residuals were when patches were last made to count more."""
+    sigma: float = 0.0
+    """Deviation of the residuals, m, where it settled before; 0: nowhere."""
 
     def refuted(self, end: End, there: Known) -> bool:
         """Whether the pattern that was taken off leaves residuals too large, or too much alike."""
@@ -162,13 +167,16 @@ class _Course:
         # a pattern may be what keeps the poses from settling
         alike = level.tied is not None and ALIKE < known.overall < self.alike
         firmer = alike and self.emphasis < len(EMPHASIS) - 1
-        more = firmer or bent or (outcome.converged and (less or finer < level.grid.spacing))
+        loose = outcome.sigma < LOOSE * self.sigma
+        settled = less or loose or finer < level.grid.spacing
+        more = firmer or bent or (outcome.converged and settled)
+        self.sigma = outcome.sigma
         if engine.clock.over or not more:
             return None
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
-        new = firmer or bent or finer < level.grid.spacing or engine.doubted
+        new = firmer or bent or loose or finer < level.grid.spacing or engine.doubted
         tied = None if new else outcome.tied
         if bent and there.believed is not None:
             taken = self.trail.next(engine.bend, there.believed.pattern)

@@ -235,16 +235,26 @@ def scores(
 
 
 @kernel
-def medians(ends, off, out):
-    """Write to ``out`` (k,) the median size of the values of each run; one run ends, one begins."""
+def medians(these, ends, off, out):
+    """Write to ``out`` (k,) the median size of the values of some runs; one ends, one begins."""
     most = 0
-    for k in range(len(out)):
+    for k in these:
         most = max(most, ends[k + 1] - ends[k])
     space = np.empty(most)
-    for k in range(len(out)):
-        n = ends[k + 1] - ends[k]
-        for i in range(n):
-            space[i] = abs(off[ends[k] + i])
-        part = space[:n]
+    for j in range(len(these)):
+        first, last = ends[these[j]], ends[these[j] + 1]
+        for i in range(first, last):
+            space[i - first] = abs(off[i])
+        part = space[: last - first]
         part.sort()
-        out[k] = part[n // 2]
+        out[j] = part[(last - first) // 2]
+
+
+@fast
+def charge_of(off, square):
+    """Return the Geman-McClure cost of values (n,) at a squared scale, m^2."""
+    total = 0.0
+    for i in range(len(off)):
+        e2 = off[i] * off[i]
+        total += e2 / (square + e2)
+    return square * total

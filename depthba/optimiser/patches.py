@@ -207,10 +207,13 @@ class Fit:
 
         ``most``: median distance from the surface of the points of a patch, m.
         """
-        patches, median = self.patches, np.empty(len(self.patches))
-        patch_kernels.medians(patches.ends[patches.views], self.off, median)
-        level = np.abs(patches.axes[:, 2, 0]) > LEVEL
-        return patches.only((median <= most) & ~level)
+        patches = self.patches
+        steep = np.flatnonzero(np.abs(patches.axes[:, 2, 0]) <= LEVEL)
+        median = np.empty(len(steep))
+        patch_kernels.medians(steep, patches.ends[patches.views], self.off, median)
+        chosen = np.zeros(len(patches), bool)
+        chosen[steep[median <= most]] = True
+        return patches.only(chosen)
 
     def counted(self, times: float) -> Fit:
         """Return the same, with all that the patches say said so many times."""
@@ -225,10 +228,10 @@ class Fit:
         """
         if not len(self.patches):
             return self
-        patches, squares = self.patches, np.square(self.off)
-        some = squares[:: -(-len(squares) // ENOUGH)]
-        scale = patches.robust * max(1.4826 * float(np.sqrt(np.median(some))), LEAST * sigma)
+        patches = self.patches
+        some = np.abs(self.off[:: -(-len(self.off) // ENOUGH)])
+        scale = patches.robust * max(1.4826 * float(np.median(some)), LEAST * sigma)
         scale = min(scale, patches.scale or scale)
-        cost = scale**2 * float((squares / (scale**2 + squares)).sum())
+        cost = patch_kernels.charge_of(self.off, scale**2)
         cost += float((patches.stiff[:, None] * patches.surface[:, 3:] ** 2).sum())
         return Fit(replace(patches, scale=scale), cost, self.off)
