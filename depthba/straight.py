@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from depthba import se3
-from depthba.compiling import kernel
+from depthba.compiling import kernel, part
 from depthba.errors import OutOfReach
 from depthba.kinematics import DhArm
 
@@ -81,7 +81,7 @@ def flange(links: Array, q: Array) -> Array:
     return T
 
 
-@kernel
+@part
 def _frames(links: Array, q: Array, T: Array) -> None:
     """Fill the frames T (n + 1, 4, 4), the base first."""
     for i in range(4):
@@ -119,7 +119,7 @@ def _follow(
     return len(T_line) - 1, _DONE
 
 
-@kernel
+@part
 def _solve(links: Array, T_goal: Array, q: Array) -> bool:
     """Bring `q` (n,) to the goal; whether it came there."""
     n = len(q)
@@ -153,7 +153,7 @@ def _solve(links: Array, T_goal: Array, q: Array) -> bool:
     return False
 
 
-@kernel
+@part
 def _error(T_goal: Array, T: Array, e: Array) -> float:
     """Fill e (6,), m and rad; its largest component."""
     for i in range(3):
@@ -169,7 +169,7 @@ def _error(T_goal: Array, T: Array, e: Array) -> float:
     return worst
 
 
-@kernel
+@part
 def _axis(T_joint: Array, T_flange: Array, J: Array, k: int) -> None:
     """Fill column k of the Jacobian (6, n): ``[z x (p_flange - p), z]``."""
     for i in range(3):
@@ -179,7 +179,7 @@ def _axis(T_joint: Array, T_flange: Array, J: Array, k: int) -> None:
         J[i + 3, k] = T_joint[i, 2]
 
 
-@kernel
+@part
 def _solve_symmetric(A: Array, x: Array) -> None:
     """Solve ``A x = b`` in place, x (m,) is b before; A (m, m), positive definite, is spent."""
     m = len(x)

@@ -52,7 +52,7 @@ def conclude(
         level.problem, level.grid, State(T_camera_start, filled(averages.heights)),
         outcome.loss, level.smooth, workers, ROUNDS, TOLERANCE,
     )  # fmt: skip
-    acting = engine.acting
+    began_lin, acting = began_lin.uncoupled(), engine.acting
     cost_start = began_lin.cost + end.temperature * acting.cost(T_camera_start)
     cost_end = linearise(
         level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth

@@ -28,7 +28,7 @@ ALIKE = 1.5
 EMPHASIS = (1.0, 1.0, 2.0, 4.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
-# It goes on when residuals have come out below this share of what they were where it settled before:
+# It goes on when residuals have come out below this share of what they were at the last settling:
 # frames that had stuck have come loose.
 LOOSE = 0.8
 # It goes on when the camera's fixed pattern calls for steps of so many standard deviations.
@@ -54,6 +54,7 @@ class Known:
     problem: Problem
     """Without the points at sharp bends."""
     lin: Linearisation
+    """Without its B."""
     correlation: certainty.Correlation
     believed: pattern.Believed | None = None
     """The fixed pattern of the camera; None: there is none."""
@@ -123,11 +124,15 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
             there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
         further = course.further(engine, end, there)
         if further is None:
-            return end, there
+            return _uncoupled(end), there
         # of many points, what was known there takes memory that finding out anew needs
         end = further
         del there
-    return end, None
+    return _uncoupled(end), None
+
+
+def _uncoupled(end: End) -> End:
+    return replace(end, outcome=replace(end.outcome, lin=end.outcome.lin.uncoupled()))
 
 
 @dataclass
@@ -156,7 +161,11 @@ class _Course:
         assert before is not None
         engine.problem, engine.bend, engine.plain = before.problem, None, True
         engine.refused_pattern, engine.emphasis = before.size, EMPHASIS[0]
-        return before.end
+        level, outcome = before.end.level, before.end.outcome
+        lin = linearise(
+            level.problem, level.grid, outcome.state, outcome.loss, engine.workers, level.smooth
+        )
+        return replace(before.end, outcome=replace(outcome, lin=lin))
 
     def further(self, engine: Engine, end: End, there: Known) -> End | None:
         """Settle anew as what is known asks for; None: it asks for nothing."""
@@ -212,7 +221,7 @@ def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:
         level.tied.patches if level.tied else None,
     )  # fmt: skip
     engine.clock.lap("certainty")
-    return Known(problem, lin, found, believed)
+    return Known(problem, lin.uncoupled(), found, believed)
 
 
 def _believed(
@@ -257,5 +266,5 @@ def _on_trial(
     assert waves is not None  # a pattern is made of them
     size = waves.size(taken)
     share = GROWN if noise is not None and size <= MODEST * noise else CLEARED
-    before = before or _Before(end, there.inflation, engine.problem, size, share)
+    before = before or _Before(_uncoupled(end), there.inflation, engine.problem, size, share)
     return replace(before, size=size, share=share)

@@ -73,7 +73,7 @@ class Ground:
         """
         self.problem, self.grid, self.state, self.loss = problem, grid, state, loss
         self.nodes = np.empty((*grid.shape, 3))
-        map_kernels.nodal_gradients(state.heights, grid.spacing, self.nodes)
+        map_kernels.nodal_rows(state.heights, grid.spacing, self.nodes, 0, len(state.heights))
         self._fronts = fronts_of(problem, state.T_map_camera)
 
     def feet(self, i: int, stride: int = 1) -> Feet:

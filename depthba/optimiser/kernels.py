@@ -19,7 +19,7 @@ from __future__ import annotations
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 import numpy as np
 
-from depthba.compiling import fast, inlined, kernel
+from depthba.compiling import fast_part, inlined, kernel, part
 
 # Height of the residual's floor: lateral noise of a point, relative to its range noise, squared.
 LATERAL = 0.05
@@ -45,7 +45,7 @@ ALL = 25 * CHUNK
 CELL_X, CELL_Y, WHICH = 0, CHUNK, 2 * CHUNK
 
 
-@kernel
+@part
 def _pose(R, t, origin, spacing):
     """Rotation, height and grid position of the sensor, and the inverse spacing, as scalars."""
     inverse = 1.0 / spacing
@@ -55,7 +55,7 @@ def _pose(R, t, origin, spacing):
     )  # fmt: skip
 
 
-@kernel
+@part
 def _inside(nodes, bx, by, width, height):
     """Lower and upper bounds in x and y of the cells with central differences in a window."""
     return (
@@ -64,7 +64,7 @@ def _inside(nodes, bx, by, width, height):
     )  # fmt: skip
 
 
-@fast
+@fast_part
 def _place(points, pose, s):
     """Rotate the points into the map frame; their grid positions go where fractions will be."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, _, ox, oy, inverse = pose
@@ -79,7 +79,7 @@ def _place(points, pose, s):
         s[FRACTION_Y + k] = y * inverse + oy
 
 
-@fast
+@fast_part
 def _settle(n, bounds, s, cells):
     """Split grid positions into cells and fractions; what is off the map is put into its corner."""
     x_low, x_high, y_low, y_high = bounds
@@ -94,7 +94,7 @@ def _settle(n, bounds, s, cells):
         s[ON + k] = s[ON + k] if inside else 0.0
 
 
-@fast
+@fast_part
 def _look(n, nodes, s, cells):
     """Read height and gradient."""
     for k in range(n):
@@ -109,7 +109,7 @@ def _look(n, nodes, s, cells):
         s[SLOPE_Y + k] = h00 * n00[2] + h10 * n10[2] + h01 * n01[2] + h11 * n11[2]
 
 
-@fast
+@fast_part
 def _walk(n, pose, front, cap, s):
     """Take a Newton step along the viewing ray to where it meets the map.
 
@@ -130,7 +130,7 @@ def _walk(n, pose, front, cap, s):
         s[FRACTION_Y + k] = y * scale + oy
 
 
-@fast
+@fast_part
 def _measure_along(n, tz, s):
     """Take the residual at the foot of the ray: the distance walked."""
     for k in range(n):
@@ -144,7 +144,7 @@ def _measure_along(n, tz, s):
         s[NORM2 + k] = nu * nu + LATERAL * (1.0 + gx * gx + gy * gy)
 
 
-@fast
+@fast_part
 def _measure_upright(n, tz, slope, s):
     """Take the vertical residual, weighed down on slopes if asked."""
     steep = 1.0 if slope else 0.0
@@ -154,7 +154,7 @@ def _measure_upright(n, tz, slope, s):
         s[NORM2 + k] = 1.0 + steep * (gx * gx + gy * gy)
 
 
-@kernel
+@part
 def _walk_on(n, pose, bounds, nodes, front, cap, s, cells, far, far_cells):
     """Take the second step for the points whose first was long."""
     count = 0
@@ -178,7 +178,7 @@ def _walk_on(n, pose, bounds, nodes, front, cap, s, cells, far, far_cells):
         cells[CELL_X + k], cells[CELL_Y + k] = far_cells[CELL_X + i], far_cells[CELL_Y + i]
 
 
-@kernel
+@part
 def _land(
     points, pose, bounds, nodes, along_ray, slope, front, cap, s, cells, far, far_cells
 ):  # fmt: skip
@@ -225,7 +225,7 @@ def feet(points, R, t, origin, spacing, nodes, along_ray, slope, front, cap, row
             cells[row, first:last] = here[row * CHUNK : row * CHUNK + n]
 
 
-@fast
+@fast_part
 def _weigh(inverse_noise, shares, c2, s, weights, residuals):
     """Give every point its robust weight and normalised residual, and its whole weight."""
     for k in range(shares.shape[0]):
@@ -240,7 +240,7 @@ def _weigh(inverse_noise, shares, c2, s, weights, residuals):
         s[WEIGHT + k] = share * psi * scale2
 
 
-@fast
+@fast_part
 def _cost(inverse_noise, shares, c2, charge, s):
     """Geman-McClure cost of a chunk at the squared scale ``c2``; 0: squares."""
     cost = 0.0
@@ -252,7 +252,7 @@ def _cost(inverse_noise, shares, c2, charge, s):
     return cost
 
 
-@fast
+@fast_part
 def _differentiate(n, arm, s):
     """Fill the Jacobian's columns and those times the weights."""
     ax, ay, az = arm[0], arm[1], arm[2]
@@ -270,7 +270,7 @@ def _differentiate(n, arm, s):
         s[WEIGHED + 5 * CHUNK + k] = w * j5
 
 
-@fast
+@fast_part
 def _sum(n, s, A, g):
     """Add the chunk's products of columns to the lower triangle of ``A`` and to ``g``."""
     for m in range(6):
@@ -298,7 +298,7 @@ def _couple(node, h, w0, w1, w2, w3, w4, w5):
     node[5] -= h * w5
 
 
-@fast
+@fast_part
 def _scatter(n, s, cells, B, bx, by, stencil):
     """Add the chunk's couplings with the map and the map's own terms, node by node."""
     left, low = np.int32(bx), np.int32(by)

@@ -74,9 +74,8 @@ def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
     Pooled over frames.
     """
     nodes = np.empty((*grid.shape, 3))
-    map_kernels.nodal_gradients(
-        filled(average(problem, T_map_camera, grid).heights), grid.spacing, nodes
-    )
+    heights = filled(average(problem, T_map_camera, grid).heights)
+    map_kernels.nodal_rows(heights, grid.spacing, nodes, 0, len(heights))
     squares, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
     for frame, T in zip(problem.frames, T_map_camera, strict=True):
         look()

@@ -5,7 +5,7 @@ One pass over all points fills the normal equations of poses and map together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,10 @@ class Linearisation:
     pivots: NDArray[np.float64]
     """(N, 3), map frame, about which the poses are perturbed."""
 
+    def uncoupled(self) -> Linearisation:
+        """Return the same without B, which takes more memory than all points."""
+        return replace(self, B=())
+
 
 def pivots_of(problem: Problem, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return each frame's centroid in the map frame, (N, 3)."""
@@ -146,7 +150,7 @@ def linearise(
     else:
         weights, residuals = spare.weights, spare.residuals
     B = tuple(
-        _footprint(f, T, grid, loss, None if spare is None else spare.B[i])
+        footprint(f, T, grid, loss, None if spare is None else spare.B[i])
         for i, (f, T) in enumerate(zip(problem.frames, state.T_map_camera, strict=True))
     )
     shares = workers.shares(problem)
@@ -196,7 +200,7 @@ def robust_sigma(residuals: tuple[NDArray[np.float32], ...]) -> float:
     return float(1.4826 * np.median(np.abs(some))) if len(some) else 0.0
 
 
-def _footprint(
+def footprint(
     frame: FramePoints,
     T: NDArray[np.float64],
     grid: Grid,

@@ -9,14 +9,11 @@ from depthba.compiling import kernel
 
 
 @kernel
-def nodal_gradients(heights, spacing, nodes):
-    """Fill ``nodes`` (ny, nx, 3) with heights and central differences, one-sided at the border."""
-    nodal_rows(heights, spacing, nodes, 0, heights.shape[0])
-
-
-@kernel
 def nodal_rows(heights, spacing, nodes, first, last):
-    """Do what :func:`nodal_gradients` does, for the rows ``first`` to ``last`` alone."""
+    """Fill ``nodes`` (ny, nx, 3) with heights and central differences, one-sided at the border.
+
+    Of the rows ``first`` to ``last`` alone.
+    """
     ny, nx = heights.shape
     for y in range(first, last):
         y0, y1 = max(y - 1, 0), min(y + 1, ny - 1)

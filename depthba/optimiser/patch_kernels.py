@@ -9,7 +9,7 @@ from __future__ import annotations
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 import numpy as np
 
-from depthba.compiling import fast, kernel
+from depthba.compiling import fast, fast_part, kernel, part
 from depthba.optimiser.patch_points import (
     CHUNK,
     COUNTS,
@@ -35,7 +35,7 @@ from depthba.optimiser.patch_points import (
 POSE, SURFACE, ERROR, COLUMNS = 0, 6, 12, 16
 
 
-@kernel
+@part
 def _charge(n, square, s, out):
     """Return what the points cost, m^2; how far they lie off goes to ``out``."""
     total = 0.0
@@ -45,7 +45,7 @@ def _charge(n, square, s, out):
     return total
 
 
-@fast
+@fast_part
 def _charge_chunk(square, s, out):
     total = 0.0
     for i in range(len(out)):
@@ -107,7 +107,7 @@ def fit(
     return total
 
 
-@fast
+@fast_part
 def _view_sums(first, last, pivot, s, z, Z):
     """Sum ``w z_a z_c`` over a view's points, a of the pose: Z (6, COLUMNS)."""
     Z[:] = 0.0

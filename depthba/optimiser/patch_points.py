@@ -15,7 +15,7 @@ from __future__ import annotations
 # mypy: disallow-untyped-defs=False, disallow-untyped-calls=False
 import numpy as np
 
-from depthba.compiling import fast, inlined, kernel
+from depthba.compiling import fast_part, inlined, kernel, part
 
 TERMS = 6
 """Coefficients of a surface."""
@@ -41,7 +41,7 @@ def spot(i):
     return (i // CHUNK) * ALL + i % CHUNK
 
 
-@kernel
+@part
 def room(first, last, ends, views):
     """Return memory for the points of any of the patches."""
     most = 0
@@ -50,7 +50,7 @@ def room(first, last, ends, views):
     return np.empty(-(-most // CHUNK) * ALL)
 
 
-@fast
+@fast_part
 def _turn(points, weights, Q, o, rays, s, at):
     """Bring some points of a view into the axes of their patch, to columns from ``at`` on."""
     q00, q01, q02 = Q[0, 0], Q[0, 1], Q[0, 2]
@@ -68,7 +68,7 @@ def _turn(points, weights, Q, o, rays, s, at):
         s[RAY_0 + k], s[RAY_1 + k], s[RAY_2 + k] = r0 * shorter, r1 * shorter, r2 * shorter
 
 
-@kernel
+@part
 def place(k, points, weights, ends, views, Q, o, rays, s):
     """Bring the points of a patch into its axes; return how many they are."""
     begin = ends[views[k]]
@@ -83,7 +83,7 @@ def place(k, points, weights, ends, views, Q, o, rays, s):
     return ends[views[k + 1]] - begin
 
 
-@fast
+@fast_part
 def meet(n, q, rays, reach, s):
     """Walk the points of a patch to its surface: feet, slopes there, norms, how far they lie off.
 
@@ -97,7 +97,7 @@ def meet(n, q, rays, reach, s):
             _meet_upright(min(CHUNK, n - first), q, chunk)
 
 
-@fast
+@fast_part
 def _meet_upright(n, q, s):
     c0, c1, c2, c3, c4, c5 = q[0], q[1], q[2], q[3], q[4], q[5]
     for i in range(n):
@@ -110,7 +110,7 @@ def _meet_upright(n, q, s):
         s[OFF + i] = y - (c0 + u * (c1 + c3 * u + c4 * v) + v * (c2 + c5 * v))
 
 
-@fast
+@fast_part
 def _meet_along(n, q, reach, s):
     c0, c1, c2, c3, c4, c5 = q[0], q[1], q[2], q[3], q[4], q[5]
     for i in range(n):
@@ -138,14 +138,14 @@ def _meet_along(n, q, reach, s):
         s[OFF + i] = e - way * cosine
 
 
-@fast
+@fast_part
 def weigh(n, square, s):
     """Say how much points count: Geman-McClure of squared scale, m^2; 0: no robust loss."""
     for first in range(0, n, CHUNK):
         _weigh(min(CHUNK, n - first), square, s[spot(first) :])
 
 
-@fast
+@fast_part
 def _weigh(n, square, s):
     for i in range(n):
         w, e = s[WEIGHT + i] / s[NORM2 + i], s[OFF + i]
@@ -153,7 +153,7 @@ def _weigh(n, square, s):
         s[COUNTS + i] = w * share * share
 
 
-@fast
+@fast_part
 def surface_sums(n, s, M, b):
     """Sum what points say of a surface: M (6, 6), its lower triangle, and b (6,)."""
     M[:] = 0.0
@@ -162,7 +162,7 @@ def surface_sums(n, s, M, b):
         _surface_sums(min(CHUNK, n - first), s[spot(first) :], M, b)
 
 
-@fast
+@fast_part
 def _surface_sums(n, s, M, b):
     """Add what a chunk says; products of terms are powers of u and v, of which there are fewer."""
     m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = 0.0
@@ -208,7 +208,7 @@ def _surface_sums(n, s, M, b):
         b[j] += value
 
 
-@kernel
+@part
 def _factor(M, L):
     """Cholesky factor of a positive definite (6, 6) matrix; only its lower triangle is read."""
     for i in range(6):
@@ -219,7 +219,7 @@ def _factor(M, L):
             L[i, j] = np.sqrt(max(s, 1e-300)) if i == j else s / L[j, j]
 
 
-@kernel
+@part
 def forward(L, b):
     """Solve ``L x = b`` in place."""
     for i in range(6):
@@ -228,7 +228,7 @@ def forward(L, b):
         b[i] /= L[i, i]
 
 
-@kernel
+@part
 def backward(L, b):
     """Solve ``L^T x = b`` in place."""
     for i in range(5, -1, -1):
@@ -237,7 +237,7 @@ def backward(L, b):
         b[i] /= L[i, i]
 
 
-@kernel
+@part
 def firm(M, stiff, L):
     """Factor a surface's normal matrix; a term that no point holds is held by next to nothing."""
     for j in range(6):
@@ -264,7 +264,7 @@ def by_surface(phi, at, s):
     phi[3], phi[4], phi[5] = u * u, u * v, v * v
 
 
-@kernel
+@part
 def into_map(H, V, out):
     """Columns of H (r, 6) from patch axes to map axes."""
     for r in range(H.shape[0]):

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.compiling import inlined, kernel
+from depthba.compiling import inlined, kernel, part
 from depthba.optimiser.patch_points import (
     COUNTS,
     OFF,
@@ -154,7 +154,7 @@ def _gather(
             _couple(i, j, s, here, pivot[view], axes[k], surfaces[k], cross[frame[view]])
 
 
-@kernel
+@part
 def _sum(n, s, waves, own, gradient, W):
     """Add a patch's points to ``own`` and ``gradient``; W (6, m) gets surface against pattern."""
     phi, m = np.zeros(6), len(gradient)
@@ -176,7 +176,7 @@ def _sum(n, s, waves, own, gradient, W):
                 W[a, j] += t * wave[j]
 
 
-@kernel
+@part
 def _eliminate(L, W, b, X, own, gradient):
     """Take the surface out, whose factor is L and gradient b; X (6, m) gets how it follows."""
     m = len(gradient)
@@ -195,7 +195,7 @@ def _eliminate(L, W, b, X, own, gradient):
             own[j, other] -= t
 
 
-@kernel
+@part
 def _couple(first, last, s, waves, pivot, V, X, cross):
     """Add what a view's points say of its pose and the pattern at once to ``cross`` (6, m)."""
     phi, J, row, P = np.zeros(6), np.zeros(6), np.zeros((1, 6)), np.zeros((6, 6))

@@ -21,10 +21,10 @@ from depthba.optimiser.dense import MANY
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import (
-    Footprint,
     Linearisation,
     Loss,
     State,
+    footprint,
     robust_sigma,
 )
 from depthba.optimiser.problem import Problem
@@ -188,12 +188,16 @@ def noise_linearisation(
         )  # fmt: skip
     heights, _ = lin.C.solve(-total, 1e-4)
     noise = np.empty((*grid.shape, 3))
-    map_kernels.nodal_gradients(heights, grid.spacing, noise)
+    map_kernels.nodal_rows(heights, grid.spacing, noise, 0, len(heights))
     A = np.zeros((count, 6, 6))
-    B = tuple(Footprint(f.y, f.x, np.zeros_like(f.values)) for f in lin.B)
+    B = tuple(
+        footprint(f, T, grid, loss, None)
+        for f, T in zip(problem.frames, state.T_map_camera, strict=True)
+    )
 
     def filled(i: int) -> None:
         feet, frame = ground.feet(i), problem.frames[i]
+        B[i].values.fill(0.0)
         probes.slope_noise(
             frame.inverse_noise, frame.share, feet.on, feet.cells, feet.fractions, feet.arms,
             feet.norm2, state.T_map_camera[i, :3, 3] - lin.pivots[i], lin.weights[i], noise, A[i],

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from depthba.compiling import fast, inlined, kernel
+from depthba.compiling import fast, fast_part, inlined, kernel
 from depthba.optimiser.workers import Workers
 
 Field = NDArray[np.float64]
@@ -202,7 +202,7 @@ class MapSolver:
         while rr > goal and n < limit:
             n += 1
             self._map(
-                lambda *band, p=p, spare=spare, beta=beta: _direct(
+                lambda *band, p=p, spare=spare, beta=beta: _direct_band(
                     self._couplings, 0, 0, r, beta, p, spare, q, sums, *band
                 )
             )
@@ -211,7 +211,7 @@ class MapSolver:
             if not curvature > 0.0:
                 break
             alpha = rr / curvature
-            self._map(lambda *band, p=p, alpha=alpha: _advance(alpha, p, q, x, r, sums, *band))
+            self._map(lambda *band, p=p, alpha=alpha: _advance_band(alpha, p, q, x, r, sums, *band))
             before, rr = rr, float(sums.sum())
             beta = rr / before
         return self._scale * x, n
@@ -262,7 +262,7 @@ def _begin(b, scale, r, sums, first, last):
         sums[y] = total
 
 
-@fast
+@fast_part
 def _next_row(r, beta, p, y, out):
     for x in range(r.shape[1]):
         out[x + 1] = r[y, x] + beta * p[y + 1, x + 1]
@@ -270,7 +270,7 @@ def _next_row(r, beta, p, y, out):
 
 # The product with a row goes in two: of more arrays at once the compiler does not prove that they
 # lie apart, and gives up on vector instructions.
-@fast
+@fast_part
 def _straight(right, up, up_below, here, above, below, q):
     for x in range(q.shape[0]):
         q[x] = (
@@ -282,7 +282,7 @@ def _straight(right, up, up_below, here, above, below, q):
         )
 
 
-@fast
+@fast_part
 def _across(across, across_below, back, back_below, here, above, below, q):
     """Add the diagonal neighbours to ``q``; return ``here . q``."""
     total = q.dtype.type(0.0)
@@ -298,7 +298,7 @@ def _across(across, across_below, back, back_below, here, above, below, q):
     return total
 
 
-@fast
+@fast_part
 def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
     """Take the next direction ``after = r + beta p`` and ``q``, its product with the matrix.
 
@@ -333,7 +333,7 @@ def _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
         sums[y] = total
 
 
-@fast
+@fast_part
 def _advance(alpha, p, q, x, r, sums, first, last):
     """Step along ``p``: ``x += alpha p``, ``r -= alpha q``; ``r . r`` by rows goes to ``sums``."""
     alpha = r.dtype.type(alpha)
@@ -345,6 +345,16 @@ def _advance(alpha, p, q, x, r, sums, first, last):
             r[y, k] = v
             total += v * v
         sums[y] = total
+
+
+@fast
+def _direct_band(couplings, y0, x0, r, beta, p, after, q, sums, first, last):
+    _direct(couplings, y0, x0, r, beta, p, after, q, sums, first, last)
+
+
+@fast
+def _advance_band(alpha, p, q, x, r, sums, first, last):
+    _advance(alpha, p, q, x, r, sums, first, last)
 
 
 @kernel
