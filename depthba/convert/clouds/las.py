@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ _CHUNK = 1 << 18
 """Points that are unpacked at once."""
 _RECORDS, _RECORD = 100, 54
 """Byte of the head at which the number of variable-length records stands, and least size of one."""
+_ITEMS = 32
+"""Byte of the record on compression at which the number of a point's items stands."""
 STEP = 1e-5
 """Of written coordinates, m; 32 bits of it reach over 40 km."""
 
@@ -32,6 +35,7 @@ def read(path: Path) -> Array:
             header = file.header
             if header.are_points_compressed:
                 _check_chunks(path, header.offset_to_point_data, header.point_count)
+                _check_items(header.vlrs.get("LasZipVlr"), header.point_format.size)
             wanted = header.point_count * header.point_format.size
             if not header.are_points_compressed and wanted > stored:
                 raise ValueError(f"{stored} bytes for {header.point_count} points")
@@ -43,7 +47,11 @@ def read(path: Path) -> Array:
                 at += len(chunk)
         if at != len(points):
             raise ValueError(f"{at} points, expected {len(points)} as its head says")
-    except Exception as error:  # broken files fail in many ways, some of them in another language
+    except Exception as error:  # broken files fail in many ways
+        raise DatasetError(f"{path}: {error}, expected a LAS or LAZ file") from error
+    except BaseException as error:  # some of them in Rust, whose panic is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
         raise DatasetError(f"{path}: {error}, expected a LAS or LAZ file") from error
     return points
 
@@ -72,6 +80,17 @@ def _check_chunks(path: Path, begin: int, points: int) -> None:
     _, chunks = struct.unpack_from("<II", data, at)
     if chunks > points + 1:
         raise ValueError(f"{chunks} chunks of {points} points")
+
+
+def _check_items(records: list[Any], size: int) -> None:
+    """Refuse parts of a compressed point that do not make up one: the library would divide by 0."""
+    data = records[0].record_data_bytes() if records else b""
+    count = struct.unpack_from("<H", data, _ITEMS)[0] if len(data) >= _ITEMS + 2 else 0
+    if len(data) < _ITEMS + 2 + 6 * count:
+        raise ValueError(f"{count} items in a record of {len(data)} bytes")
+    sizes = [struct.unpack_from("<HHH", data, _ITEMS + 2 + 6 * k)[1] for k in range(count)]
+    if sum(sizes) != size:
+        raise ValueError(f"items of {sum(sizes)} bytes for points of {size}")
 
 
 def write(path: Path, points: Array, colours: NDArray[np.uint8] | None) -> None:

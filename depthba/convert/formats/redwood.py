@@ -90,6 +90,8 @@ def _log(path: Path) -> Path | None:
 
 def _places(log: Path, expected: int) -> list[int]:
     """Return the place of the frame of each pose; in order where the log has matrices alone."""
+    if not expected:
+        raise DatasetError(f"{log}: no pose, expected a 4 x 4 matrix for each frame")
     heads = [line.split() for line in files.text(log).splitlines() if len(line.split()) == 3]
     try:
         places = [int(words[0]) for words in heads] or list(range(expected))
