@@ -30,6 +30,17 @@ for threads in map(int, sys.argv[2:]):
     result = depthba.register(sys.argv[1], depthba.Options(threads=threads, **OPTIONS))
     print(json.dumps(bits(result)))
 """
+COMPILED = """
+import hashlib
+import numpy as np
+from depthba.optimiser.laying import lay
+from depthba.optimiser.workers import Workers
+from tests.depthba.balls import balls, poses
+rng = np.random.default_rng(0)
+T = poses(rng, 1e-3, 1e-3)
+fit = lay(balls(rng, T, 3e-4), T, (0.06, 0.03), 3.5, 3e-4, Workers(1))
+print(hashlib.sha256(fit.patches.surface.tobytes() + fit.off.tobytes()).hexdigest())
+"""
 
 
 def bits(result: Result) -> list[str]:
@@ -64,6 +75,23 @@ def test_runs_processes_and_threads_give_the_same_bits(scene: Dataset) -> None:
         )  # fmt: skip
         found = [json.loads(line) for line in there.stdout.splitlines()]
         assert found == [here] * len(threads)
+
+
+def test_kernels_from_the_disk_give_the_bits_of_those_that_were_just_compiled(
+    tmp_path: Path,
+) -> None:
+    """Parts that were not one with their kernel came to run in the place of another's."""
+    root = Path(__file__).resolve().parents[2]
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", COMPILED], capture_output=True, text=True, timeout=300,
+            check=True,
+            env=os.environ | {"PYTHONPATH": str(root), "NUMBA_CACHE_DIR": str(tmp_path)},
+        ).stdout
+        for _ in range(2)
+    ]  # fmt: skip
+    assert list(tmp_path.rglob("*.nbc")) and len(found[0]) > 60
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
