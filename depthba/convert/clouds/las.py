@@ -21,6 +21,8 @@ _RECORDS, _RECORD = 100, 54
 """Byte of the head at which the number of variable-length records stands, and least size of one."""
 _ITEMS = 32
 """Byte of the record on compression at which the number of a point's items stands."""
+_TOGETHER, _MOST_TOGETHER, _AS_TOLD = 12, 1 << 21, (1 << 32) - 1
+"""Byte of the points in a chunk there; most that are taken; what stands for: as the table says."""
 STEP = 1e-5
 """Of written coordinates, m; 32 bits of it reach over 40 km."""
 
@@ -83,9 +85,15 @@ def _check_chunks(path: Path, begin: int, points: int) -> None:
 
 
 def _check_items(records: list[Any], size: int) -> None:
-    """Refuse parts of a compressed point that do not make up one: the library would divide by 0."""
+    """Refuse items of a compressed point that do not make up one, and chunks too large for memory.
+
+    The library would divide by 0, and end the process.
+    """
     data = records[0].record_data_bytes() if records else b""
     count = struct.unpack_from("<H", data, _ITEMS)[0] if len(data) >= _ITEMS + 2 else 0
+    (together,) = struct.unpack_from("<I", data, _TOGETHER) if data[_TOGETHER + 3 :] else (0,)
+    if _MOST_TOGETHER < together < _AS_TOLD:
+        raise ValueError(f"chunks of {together} points")
     if len(data) < _ITEMS + 2 + 6 * count:
         raise ValueError(f"{count} items in a record of {len(data)} bytes")
     sizes = [struct.unpack_from("<HHH", data, _ITEMS + 2 + 6 * k)[1] for k in range(count)]
