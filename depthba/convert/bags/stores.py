@@ -46,10 +46,11 @@ class _Bag:
             self._reader.open()
         except Exception as error:  # broken bags fail in many ways
             raise DatasetError(f"{path}: {error}, expected a bag of ROS 1 or 2") from error
+        for connection in self._reader.connections:
+            for name in (connection.topic, connection.msgtype):
+                if not isinstance(name, str):
+                    raise DatasetError(f"{path}: topic or type {name!r}, expected a name")
         self.topics = {c.topic: c.msgtype for c in self._reader.connections}
-        for name in (*self.topics, *self.topics.values()):
-            if not isinstance(name, str):
-                raise DatasetError(f"{path}: topic or type {name!r}, expected a name")
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         wanted = set(topics)
