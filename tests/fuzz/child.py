@@ -116,7 +116,8 @@ def guided(name: str, home: Path, seconds: float, seed: int, keep: Path) -> None
         include=["depthba.dataset", "depthba.convert", "depthba.trajectory", "depthba.ply",
                  "depthba.stored_run", "depthba.ur_calibration", "rig.session", "rig.hand_eye",
                  "sim.controller", "depthba.verbs.arguments"],
-        exclude=["depthba.convert.clouds.pcd"],  # numba compiles what is in it
+        # numba compiles what is in them
+        exclude=["depthba.convert.clouds.pcd", "depthba.straight", "depthba.optimiser"],
     ):  # fmt: skip
         place = Place(name, home, Judge(DEADLINE))
     corpus = keep / "corpus"
