@@ -245,9 +245,9 @@ def medians(these, ends, off, out):
         first, last = ends[these[j]], ends[these[j] + 1]
         for i in range(first, last):
             space[i - first] = abs(off[i])
-        part = space[: last - first]
-        part.sort()
-        out[j] = part[(last - first) // 2]
+        sizes = space[: last - first]
+        sizes.sort()
+        out[j] = sizes[(last - first) // 2]
 
 
 @fast
