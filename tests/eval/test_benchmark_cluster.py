@@ -5,51 +5,21 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import subprocess
-import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from eval.benchmark.warming import small_dataset
+from tests.processes import command, dask_scheduler, dask_worker, until
 
 pytest.importorskip("distributed", reason="needs depthba[distributed]")
 pytestmark = pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 
-ROOT = Path(__file__).parents[2]
 COUNTS = "tests.eval.odd_methods:Counts"
 # What hangs on the hour, the machine and the words of the command.
 PASSING = {"seconds", "total_seconds", "memory_bytes", "memory", "command"}
-
-
-@contextlib.contextmanager
-def command(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """A process in a group of its own, of which nothing is left behind."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", *words],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, 9)
-        process.wait()
-
-
-def until(true: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, f"{what}: not within {seconds} s"
-        time.sleep(0.02)
 
 
 def lasting(value: Any) -> Any:
@@ -77,24 +47,17 @@ def words(datasets: list[Path], methods: str, out: Path, *more: str) -> list[str
 
 def check(folder: Path, count: int, methods: str) -> None:
     """Run a benchmark on a cluster with losses and gains, and plainly; compare the reports."""
-    data, cluster, plain, about = (
-        folder / name for name in ("data", "cluster", "plain", "scheduler.json")
-    )
+    data, cluster, plain = (folder / name for name in ("data", "cluster", "plain"))
     data.mkdir()
     datasets = [small_dataset(data / f"waves-{k}").path for k in range(count)]
     log = data / "runs.txt"
-    loopback = ["--host", "127.0.0.1", "--no-dashboard"]
 
     def lines() -> list[list[str]]:
         return [line.split() for line in log.read_text().splitlines()] if log.exists() else []
 
     with contextlib.ExitStack() as stack:
-        scheduler = ["dask", "scheduler", *loopback, "--port", "0", "--scheduler-file", str(about)]
-        stack.enter_context(command(*scheduler))
-        until(about.exists, "scheduler")
-        address = json.loads(about.read_text())["address"]
-        worker = ["dask", "worker", address, *loopback, "--nthreads", "1", "--no-nanny"]
-        worker += ["--local-directory", str(folder / "dask")]
+        address = stack.enter_context(dask_scheduler(folder))
+        worker = dask_worker(address, folder / "dask")
         doomed = stack.enter_context(command(*worker))
         others = [stack.enter_context(command(*worker))]
         asked = stack.enter_context(

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import random
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +17,7 @@ import sim
 from depthba.dataset import verify
 from depthba.errors import DepthbaError, OptionError
 from sim.batch import Failure, generate_many
+from tests.processes import command, dask_scheduler, dask_worker, until
 from tests.sim import heaps
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
@@ -45,36 +43,8 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> Tree:
     return tree(out)
 
 
-@contextlib.contextmanager
-def command(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """A process in a group of its own, of which nothing is left behind."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-        start_new_session=True,
-        # whoever runs the tests in the background may have switched the signal off
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-
-
 def batch(out: Path, *words: str, scene: str = HEAP, count: int = COUNT) -> list[str]:
     return ["depthba", "generate", scene, "--out", str(out), "--count", str(count), *WORDS, *words]
-
-
-def until(true: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, f"{what}: not within {seconds} s"
-        time.sleep(0.005)
 
 
 def committed(out: Path) -> int:
@@ -153,7 +123,8 @@ def test_killed_and_given_again_all_is_as_if_undisturbed(
 
 
 def test_a_second_batch_is_refused_and_ctrl_c_ends_the_first(tmp_path: Path) -> None:
-    with command(*batch(tmp_path, "--workers", "2", count=500)) as process:
+    words = batch(tmp_path, "--workers", "2", count=500)
+    with command(*words, stderr=subprocess.PIPE) as process:
         until(lambda: committed(tmp_path) > 4, "frames")
         with pytest.raises(DepthbaError, match=f"process {process.pid} on .* is generating here"):
             generate_many(HEAP, tmp_path, 2, OPTIONS)
@@ -193,16 +164,11 @@ def test_a_cluster_makes_the_same_bytes_and_outlives_a_killed_worker(
     expected: Tree, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="needs depthba[distributed]")
-    out, about = tmp_path / "out", tmp_path / "scheduler.json"
-    loopback = ["--host", "127.0.0.1", "--no-dashboard"]
+    out = tmp_path / "out"
     with contextlib.ExitStack() as stack:
-        words = ["dask", "scheduler", *loopback, "--port", "0", "--scheduler-file", str(about)]
-        stack.enter_context(command(*words))
-        until(about.exists, "scheduler")
-        address = json.loads(about.read_text())["address"]
+        address = stack.enter_context(dask_scheduler(tmp_path))
         assert address.startswith("tcp://127.0.0.1:")
-        words = ["dask", "worker", address, *loopback, "--nthreads", "1", "--no-nanny"]
-        words += ["--local-directory", str(tmp_path / "dask")]
+        words = dask_worker(address, tmp_path / "dask")
         doomed, _ = [stack.enter_context(command(*words)) for _ in range(2)]
         process = stack.enter_context(command(*batch(out, "--scheduler", address)))
         until(lambda: committed(out) > 3, "frames")
