@@ -24,8 +24,8 @@ from depthba.optimiser import dense
 from depthba.optimiser.asking import look
 from depthba.optimiser.coupling import gather, spread, spread_over
 from depthba.optimiser.linearise import Linearisation
+from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.reduced import Reduction, lumped
-from depthba.optimiser.stencil import MapSolver
 from depthba.optimiser.workers import Workers
 
 # Largest tolerance of a solve with the map's block: a looser one ends an iteration sooner or later

@@ -22,10 +22,10 @@ from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Feet, Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
+from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.patch_waves import Told
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.reduced import Reduction
-from depthba.optimiser.stencil import MapSolver
 from depthba.optimiser.waves import Waves
 from depthba.optimiser.workers import Workers
 
@@ -165,7 +165,7 @@ def answers(
 
     def answer(k: int) -> None:
         field = fields[:, :, k].astype(np.float64)
-        found[:, :, k] = solver.solve_window(field, 0, 0, TOLERANCE)
+        found[:, :, k], _ = solver.solve(field, TOLERANCE)
         # the solves are loose, the product is not: with what a solve leaves added to the field its
         # error is of second order in the tolerance
         fields[:, :, k] += field - lin.C.times(found[:, :, k].astype(np.float64))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from depthba.compiling import kernel
 from depthba.optimiser.coupling import meet
 from depthba.optimiser.linearise import Footprint, Linearisation
-from depthba.optimiser.stencil import MapSolver
+from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.workers import Workers
 
 # Nodes beyond a footprint after which the map's answer to it has died away: where there are data it
@@ -121,7 +121,6 @@ def reduce(
     precision is enough for X whatever the tolerance.
     """
     n = len(lin.B)
-    solver = MapSolver(lin.C, tolerance)
     spans = windows(lin)
 
     def columns(i: int) -> tuple[Footprint, Footprint]:
@@ -130,12 +129,13 @@ def reduce(
         X, R = np.zeros((*shape, 6), np.float32), np.zeros((*shape, 6), np.float32)
         if (free is None or free[i]) and foot.values.any():
             C = lin.C.window(ys, xs)
+            solver = MapSolver(C, tolerance)
             inner = foot.y - ys.start, foot.x - xs.start
             h, w = foot.values.shape[:2]
             b = np.zeros(shape)
             for m in range(6):
                 b[inner[0] : inner[0] + h, inner[1] : inner[1] + w] = foot.values[..., m]
-                X[..., m] = solver.solve_window(b, ys.start, xs.start, tolerance)
+                X[..., m], _ = solver.solve(b, tolerance)
                 R[..., m] = b - C.times(X[..., m].astype(float))
         return Footprint(ys.start, xs.start, X), Footprint(ys.start, xs.start, R)
 

@@ -27,6 +27,7 @@ from depthba.optimiser.linearise import (
     footprint,
     robust_sigma,
 )
+from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import Workers
 
@@ -186,7 +187,7 @@ def noise_linearisation(
             lin.weights[i],
             rng.standard_normal(len(frame)), total,
         )  # fmt: skip
-    heights, _ = lin.C.solve(-total, 1e-4)
+    heights, _ = MapSolver(lin.C, 1e-4).solve(-total, 1e-4)
     noise = np.empty((*grid.shape, 3))
     map_kernels.nodal_rows(heights, grid.spacing, noise, 0, len(heights))
     A = np.zeros((count, 6, 6))

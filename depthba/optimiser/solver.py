@@ -17,11 +17,11 @@ from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, robust_sigma
+from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.mixing import Mixer
 from depthba.optimiser.patches import Fit
 from depthba.optimiser.prior import PosePrior, move
 from depthba.optimiser.problem import Problem
-from depthba.optimiser.stencil import MapSolver
 from depthba.optimiser.workers import Workers
 
 # Factor by which steps are taken to shrink before two of them say more.

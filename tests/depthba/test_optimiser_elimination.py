@@ -9,6 +9,7 @@ import pytest
 
 from depthba.optimiser import eliminate, reduced
 from depthba.optimiser.linearise import Linearisation, Workers, linearise
+from depthba.optimiser.map_solver import MapSolver
 from tests.depthba.optimiser_problems import (
     LOSSES,
     RANGE,
@@ -47,11 +48,12 @@ def test_stencil_is_the_dense_matrix(lin: Linearisation) -> None:
 
 def test_stencil_solves(lin: Linearisation) -> None:
     C, b = stencil_dense(lin), np.random.default_rng(1).standard_normal(lin.g_map.shape)
-    got, iterations = lin.C.solve(b, 1e-12, 5000)
+    solver = MapSolver(lin.C, 1e-12)
+    got, iterations = solver.solve(b, 1e-12, 5000)
     assert 0 < iterations < 5000
     want = np.linalg.solve(C, b.ravel())
     np.testing.assert_allclose(got.ravel(), want, atol=1e-8 * np.abs(want).max())
-    assert lin.C.solve(np.zeros_like(b)) == (pytest.approx(np.zeros_like(b)), 0)
+    assert solver.solve(np.zeros_like(b), 1e-12) == (pytest.approx(np.zeros_like(b)), 0)
 
 
 def test_exact_agrees_with_dense(lin: Linearisation) -> None:
