@@ -22,10 +22,10 @@ from depthba.optimiser.problem import Problem
 AGAIN = 12
 # Residuals more alike than this many times what independent ones would be are the map's to blame
 # for, too, which has one height per node. Patches beside it then count so many times, from one
-# settling to the next, for as long as that leaves residuals less alike: less before the poses have
-# settled, since patches hold what they tie.
+# settling to the next, for as long as that leaves residuals less alike, and as before once it does
+# not: less before the poses have settled, since patches hold what they tie.
 ALIKE = 1.5
-EMPHASIS = (1.0, 1.0, 2.0, 4.0)
+EMPHASIS = (1.0, 1.0, 4.0, 16.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
 # It goes on when residuals have come out below this share of what they were at the last settling:
@@ -142,6 +142,8 @@ class _Course:
     before: _Before | None = None
     trail: Trail = field(default_factory=Trail)
     emphasis: int = 0
+    firm: bool = False
+    """Whether patches have been found to count as much as they should."""
     alike: float = np.inf
     """How much alike residuals were when patches were last made to count more."""
     sigma: float = 0.0
@@ -157,7 +159,8 @@ class _Course:
 
     def back(self, engine: Engine) -> End:
         """Put all points back to where they were measured; return where that was."""
-        before, self.before, self.emphasis, self.alike = self.before, None, 0, np.inf
+        before, self.before = self.before, None
+        self.emphasis, self.firm, self.alike = 0, False, np.inf
         assert before is not None
         engine.problem, engine.bend, engine.plain = before.problem, None, True
         engine.refused_pattern, engine.emphasis = before.size, EMPHASIS[0]
@@ -174,32 +177,39 @@ class _Course:
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
         # a pattern may be what keeps the poses from settling
-        alike = level.tied is not None and ALIKE < known.overall < self.alike
-        firmer = alike and self.emphasis < len(EMPHASIS) - 1
+        change = self._change(known.overall) if level.tied else 0
         loose = outcome.sigma < LOOSE * self.sigma
         settled = less or loose or finer < level.grid.spacing
-        more = firmer or bent or (outcome.converged and settled)
+        more = change or bent or (outcome.converged and settled)
         self.sigma = outcome.sigma
         if engine.clock.over or not more:
             return None
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
-        new = firmer or bent or loose or finer < level.grid.spacing or engine.doubted
+        new = change or bent or loose or finer < level.grid.spacing or engine.doubted
         tied = None if new else outcome.tied
         if bent and there.believed is not None:
             taken = self.trail.next(engine.bend, there.believed.pattern)
             self.before = _on_trial(engine, self.before, end, there, taken)
             level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
-        if firmer:
-            self.emphasis, self.alike = self.emphasis + 1, known.overall
+        if change:
+            self.emphasis, self.firm, self.alike = self.emphasis + change, change < 0, known.overall
             engine.emphasis = EMPHASIS[self.emphasis]
         if finer < level.grid.spacing:
             index += 1
             coarse = Map(state.heights, level.grid)
             level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
         return engine.settle(level, state, lin, index, known, tied)
+
+    def _change(self, overall: float) -> int:
+        """Return by how many steps of `EMPHASIS` patches should count more, or less."""
+        if self.firm or overall <= ALIKE:
+            return 0
+        if overall < self.alike:
+            return int(self.emphasis < len(EMPHASIS) - 1)
+        return -int(EMPHASIS[self.emphasis] > EMPHASIS[max(self.emphasis - 1, 0)])
 
 
 def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:

@@ -1,7 +1,8 @@
 """Lays patches over points: finds in which voxels several frames see something with a side.
 
 Points are sorted into voxels; which way a patch faces is read from the scatter *within* frames,
-which misaligned poses do not blur.
+which misaligned poses do not blur. Frames that see it from one side and from the other see two
+surfaces: a thin wall would else draw them together by its thickness.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class Cloud:
     source: NDArray[np.int32]
     """(n,), index of each point among those of its frame."""
     rays: bool
-    """Whether points lie on rays from the origin of their sensor."""
+    """Whether to take residuals along rays from the origin of their sensor."""
+    sided: bool
+    """Whether points were seen from that origin, which tells the sides of a surface apart."""
 
     @staticmethod
     def of(problem: Problem) -> Cloud:
@@ -56,6 +59,7 @@ class Cloud:
             np.concatenate([f.inverse_noise for f in problem.frames]).astype(np.float64) ** 2,
             np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
             np.concatenate([np.arange(n, dtype=np.int32) for n in sizes]),
+            problem.origin,
             problem.origin,
         )
 
@@ -91,7 +95,7 @@ def lay(
     left, parts = np.arange(len(x)), []
     for side in sides:
         look()
-        parts.append(_voxels(x, cloud, left, side))
+        parts.append(_voxels(x, cloud, T_map_camera[:, :3, 3], left, side))
         left = parts[-1].left
     order = np.concatenate([p.points for p in parts])
     each = np.repeat(sides, [len(p.centre) for p in parts])
@@ -143,8 +147,11 @@ class _Found:
     """Indices of the points on none, ascending."""
 
 
-def _voxels(x: Array, cloud: Cloud, these: Ints, side: float) -> _Found:
-    """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m."""
+def _voxels(x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float) -> _Found:
+    """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m.
+
+    ``cameras`` (N, 3) stand there.
+    """
     if not len(these):
         none = np.empty(0, np.int64)
         return _Found(
@@ -174,24 +181,41 @@ def _voxels(x: Array, cloud: Cloud, these: Ints, side: float) -> _Found:
     values, axes = np.linalg.eigh(pooled)
     good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
-    moment = [np.bincount(on, weight[many] * mean[many, a], k) for a in range(3)]
-    centre = np.stack(moment, axis=1) / np.maximum(total, 1e-300)[:, None]
-    chosen = np.zeros(m, bool)
-    chosen[np.flatnonzero(many)[good[on]]] = True
-    sizes = np.diff(begins)
-    taken = order[np.repeat(chosen, sizes)]
+    views = np.flatnonzero(many)[good[on]]
+    patch = on[good[on]]
+    if cloud.sided:
+        middle = _means(patch, weight[views], mean[views], k)
+        from_there = cameras[frame[views]] - middle[patch]
+        patch = 2 * patch + (np.einsum("ij,ij->i", from_there, axes[patch, :, 0]) > 0)
+        axes = np.repeat(axes, 2, axis=0)
+        # a patch's views are one run; by frame, as they came
+        by_patch = np.argsort(patch, kind="stable")
+        views, patch = views[by_patch], patch[by_patch]
+    count = np.bincount(patch, minlength=len(axes))
+    views, patch = views[count[patch] >= SEVERAL], patch[count[patch] >= SEVERAL]
+    used = np.flatnonzero(count >= SEVERAL)
+    sizes = np.diff(begins)[views]
+    ends = np.cumsum(sizes)
+    taken = order[np.repeat(begins[views] - (ends - sizes), sizes) + np.arange(sizes.sum())]
     rest = np.zeros(len(x), bool)
     rest[these] = True
     rest[taken] = False
     return _Found(
         taken,
-        sizes[chosen],
-        frame[chosen],
-        np.bincount(on, minlength=k)[good],
-        axes[good],
-        centre[good],
+        sizes,
+        frame[views],
+        count[used],
+        axes[used],
+        _means(patch, weight[views], mean[views], len(axes))[used],
         np.flatnonzero(rest),
     )
+
+
+def _means(group: Ints, weight: Array, mean: Array, count: int) -> Array:
+    """Return the weighted mean (count, 3) of means (n, 3) by group (n,)."""
+    total = np.maximum(np.bincount(group, weight, count), 1e-300)
+    sums = [np.bincount(group, weight * mean[:, a], count) for a in range(3)]
+    return np.stack(sums, axis=1) / total[:, None]
 
 
 def _voxel_of(x: Array, these: Ints, side: float) -> tuple[Ints, int]:

@@ -36,4 +36,6 @@ def balls(rng, T, sigma, points=2500, flat=0.0):
         way = np.linalg.norm(p, axis=1)
         clouds.append(p * (1 + sigma * rng.normal(size=points) / way)[:, None])
     frame, source = np.indices((N, points), np.int32).reshape(2, -1)
-    return Cloud(np.concatenate(clouds, dtype=np.float32), np.ones(N * points), frame, source, True)
+    return Cloud(
+        np.concatenate(clouds, dtype=np.float32), np.ones(N * points), frame, source, True, False
+    )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from depthba import se3
 from depthba.optimiser import tying
 from depthba.optimiser.laying import Cloud, lay
 from depthba.optimiser.patches import Patches
@@ -167,12 +169,39 @@ def test_a_voxel_that_one_frame_sees_is_no_patch(workers):
     T = poses(rng)
     cloud = balls(rng, T, 1e-4)
     alone = cloud.frame == 1
-    one = Cloud(
-        cloud.points[alone], cloud.weights[alone], cloud.frame[alone], cloud.source[alone], True
-    )
+    one = cloud.weighed(alone.astype(float))
     fit = lay(one, T, (0.06, 0.03), 3.5, 1e-4, workers)
     assert len(fit.patches) == 0
     assert fit.cost == 0.0
     A, g = fit.patches.normal_equations(T, T[:, :3, 3], workers)
     assert not A.any()
     assert not g.any()
+
+
+@pytest.mark.parametrize("sided", [True, False])
+def test_the_two_sides_of_a_thin_wall_are_two_surfaces(workers, sided):
+    rng, half = np.random.default_rng(1), 0.002
+    left, right = se3.make(np.eye(3), [-0.5, 0.0, 0.2]), se3.make(np.eye(3), [0.5, 0.0, 0.2])
+    T = np.stack([left, left, right, right])
+    T[1::2, 1, 3] = 0.1
+    frame = np.repeat(np.arange(4, dtype=np.int32), 2000)
+    wall = rng.uniform([0, -0.15, 0], [0, 0.15, 0.2], (len(frame), 3))
+    wall[:, 0] = np.where(frame < 2, -half, half) + 1e-4 * rng.normal(size=len(frame))
+    cloud = Cloud(
+        (wall - T[frame, :3, 3]).astype(np.float32), np.ones(len(frame)), frame,
+        np.tile(np.arange(2000, dtype=np.int32), 4), False, sided,
+    )  # fmt: skip
+    # voxels that hold both sides
+    off = np.eye(4)
+    off[:3, 3] = 0.015
+    fit = lay(cloud, off @ T, (0.03,), 3.5, 1e-4, workers)
+    seen = [set(fit.patches.frame[a:b] // 2) for a, b in pairwise(fit.patches.views)]
+    if sided:
+        assert seen.count({0}) > 20 and seen.count({1}) > 20 and {0, 1} not in seen
+        assert fit.patches.deviation < 1.5e-4
+        # and all points of a patch are its own: each in one patch, by view
+        x = fit.patches.points + T[np.repeat(fit.patches.frame, np.diff(fit.patches.ends)), :3, 3]
+        side = np.repeat(fit.patches.frame // 2, np.diff(fit.patches.ends))
+        np.testing.assert_allclose(x[:, 0], np.where(side == 0, -half, half), atol=6e-4)
+    else:
+        assert seen.count({0, 1}) > 20 and fit.patches.deviation > 1e-3
