@@ -197,11 +197,12 @@ class _Course:
         if change:
             self.emphasis, self.firm, self.alike = self.emphasis + change, change < 0, known.overall
             engine.emphasis = EMPHASIS[self.emphasis]
+        S: NDArray[np.float64] | None = end.S
         if finer < level.grid.spacing:
-            index += 1
+            index, S = index + 1, None
             coarse = Map(state.heights, level.grid)
             level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
-        return engine.settle(level, state, lin, index, known, tied)
+        return engine.settle(level, state, lin, index, known, S, tied)
 
     def _change(self, overall: float) -> int:
         """Return by how many steps of `EMPHASIS` patches should count more, or less."""

@@ -73,6 +73,8 @@ class End:
     """Of the level, from the coarsest."""
     believed: float
     """Factor on the variance of what the points say that was reckoned with."""
+    S: NDArray[np.float64]
+    """(6N, 6N) the reduced matrix about there, without patches."""
 
 
 @dataclass
@@ -161,8 +163,8 @@ class Engine:
                 if level.tied or shown.wrong > NOTICEABLE:
                     # where the poses have got to, patches lie better and points show their noise
                     level = self.weighed(level, shown)
-                    return self.settle(level, state, lin, index, known)
-                return End(level, outcome, temperature, index, believed)
+                    return self.settle(level, state, lin, index, known, S)
+                return End(level, outcome, temperature, index, believed, S)
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
             if known and self.options.resolution is None:
                 levels, known = self._no_finer(levels, index, level, outcome, known)
@@ -170,20 +172,30 @@ class Engine:
 
     def settle(
         self, level: Level, state: State, lin: Linearisation, index: int,
-        known: certainty.Correlation | None, tied: Fit | None = None,
+        known: certainty.Correlation | None, S: NDArray[np.float64] | None = None,
+        tied: Fit | None = None,
     ) -> End:  # fmt: skip
         """Settle on the last level's map, and on patches beside it, which are laid anew.
 
-        ``tied``: keep these.
+        Args:
+            level: the map, and the points.
+            state: where to start.
+            lin: the linearisation there.
+            index: of the level.
+            known: how the residuals are correlated.
+            S: (6N, 6N) the reduced matrix on this map at poses nearby, if there is one: steps need
+                no better, only what guards them against noise in slopes does.
+            tied: patches to keep.
         """
         level = replace(level, tied=tied) if tied else self.patched(level, state, lin)
         phase = phases(1, self.preset)[-1]
-        S = reduced.reduce(lin, self.workers, NEAR, self.free).S
+        if S is None or self._guarded:
+            S = reduced.reduce(lin, self.workers, NEAR, self.free).S
         temperature, outcome = self._descend(
             level, state, lin, S, phase, index, index + 1, known, True
         )
         self.clock.lap(f"level {index} {phase}")
-        return End(level, outcome, temperature, index, known.inflation if known else 1.0)
+        return End(level, outcome, temperature, index, known.inflation if known else 1.0, S)
 
     def _shown(self, level: Level, outcome: Outcome) -> ByRange:
         """Return how the noise over the range differs from the one reckoned with."""
@@ -350,12 +362,17 @@ class Engine:
             lambda: self.clock.over, level.tied,
         )  # fmt: skip
 
+    @property
+    def _guarded(self) -> bool:
+        """Whether noise in the map's slope may be a part of what the data say that matters."""
+        return self.preset.prior and self.noisy * FINER >= NOISY
+
     def _sure(
         self, level: Level, state: State, lin: Linearisation, S: NDArray[np.float64],
         temperature: float,
     ) -> NDArray[np.float64] | None:  # fmt: skip
         """Return what of S is not noise in the map's slope; None where that is next to all."""
-        if not self.preset.prior or self.noisy * FINER < NOISY:
+        if not self._guarded:
             return None
         matrix, _ = self.prior.normal_equations(state.T_map_camera, lin.pivots)
         held = temperature * matrix

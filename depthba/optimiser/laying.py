@@ -66,6 +66,8 @@ class Cloud:
     def weighed(self, factor: Array) -> Cloud:
         """Return the points with their weights times a factor (n,), without those of none."""
         k = factor > 0
+        if k.all():
+            return replace(self, weights=factor * self.weights)
         return replace(
             self,
             points=self.points[k],
@@ -91,11 +93,11 @@ def lay(
     """
     n = len(T_map_camera)
     x = np.empty(cloud.points.shape)
-    laying_kernels.to_map(cloud.points, cloud.frame, T_map_camera, x)
+    workers.over(len(x), laying_kernels.to_map, cloud.points, cloud.frame, T_map_camera, x)
     left, parts = np.arange(len(x)), []
     for side in sides:
         look()
-        parts.append(_voxels(x, cloud, T_map_camera[:, :3, 3], left, side))
+        parts.append(_voxels(x, cloud, T_map_camera[:, :3, 3], left, side, workers))
         left = parts[-1].left
     order = np.concatenate([p.points for p in parts])
     each = np.repeat(sides, [len(p.centre) for p in parts])
@@ -147,7 +149,9 @@ class _Found:
     """Indices of the points on none, ascending."""
 
 
-def _voxels(x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float) -> _Found:
+def _voxels(
+    x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float, workers: Workers
+) -> _Found:
     """Find patches among some of the points x (n, 3), ascending, in voxels of the given side, m.
 
     ``cameras`` (N, 3) stand there.
@@ -157,7 +161,7 @@ def _voxels(x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float) ->
         return _Found(
             none, none, none.astype(np.int32), none, np.empty((0, 3, 3)), np.empty((0, 3)), these
         )
-    voxel, k = _voxel_of(x, these, side)
+    voxel, k = _voxel_of(x, these, side, workers)
     order = np.empty_like(these)
     laying_kernels.sort_by(voxel, k, order)
     look()
@@ -169,7 +173,7 @@ def _voxels(x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float) ->
     begins = np.append(begins, len(order))
     m = len(frame)
     weight, mean, spread = np.empty(m), np.empty((m, 3)), np.empty((m, 3, 3))
-    laying_kernels.moments(order, begins, x, cloud.weights, weight, mean, spread)
+    workers.over(m, laying_kernels.moments, order, begins, x, cloud.weights, weight, mean, spread)
     look()
     many = np.diff(begins) >= FEWEST
     several = np.bincount(voxel[many], minlength=k) >= SEVERAL
@@ -178,7 +182,12 @@ def _voxels(x: Array, cloud: Cloud, cameras: Array, these: Ints, side: float) ->
     on, k = (np.cumsum(several) - 1)[voxel[many]], int(several.sum())
     total, pooled = np.bincount(on, weight[many], k), np.zeros((k, 3, 3))
     np.add.at(pooled, on, spread[many])
-    values, axes = np.linalg.eigh(pooled)
+    values, axes = np.empty((k, 3)), np.empty((k, 3, 3))
+
+    def decompose(first: int, last: int) -> None:
+        values[first:last], axes[first:last] = np.linalg.eigh(pooled[first:last])
+
+    workers.over(k, decompose)
     good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     views = np.flatnonzero(many)[good[on]]
@@ -218,12 +227,12 @@ def _means(group: Ints, weight: Array, mean: Array, count: int) -> Array:
     return np.stack(sums, axis=1) / total[:, None]
 
 
-def _voxel_of(x: Array, these: Ints, side: float) -> tuple[Ints, int]:
+def _voxel_of(x: Array, these: Ints, side: float, workers: Workers) -> tuple[Ints, int]:
     """Return the voxel of some points, numbered in order without gaps, and how many there are."""
     least, most = np.empty(3, np.int64), np.empty(3, np.int64)
     laying_kernels.extent(x, these, side, least, most)
     key, spans = np.empty_like(these), most - least + 1
-    laying_kernels.number(x, these, side, least, spans, key)
+    workers.over(len(key), laying_kernels.number, x, these, side, least, spans, key)
     if float(np.prod(spans.astype(float))) > SPARSE * len(key):
         used, numbers = np.unique(key, return_inverse=True)
         return numbers, len(used)

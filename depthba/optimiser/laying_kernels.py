@@ -9,9 +9,9 @@ from depthba.compiling import kernel
 
 
 @kernel
-def to_map(points, frame, T, out):
-    """Bring points (n, 3) of the given frames (n,) into the map frame."""
-    for i in range(len(points)):
+def to_map(first, last, points, frame, T, out):
+    """Bring some of the points (n, 3) of the given frames (n,) into the map frame."""
+    for i in range(first, last):
         pose = T[frame[i]]
         for a in range(3):
             out[i, a] = (
@@ -35,9 +35,9 @@ def extent(x, these, side, least, most):
 
 
 @kernel
-def number(x, these, side, least, spans, out):
-    """Write to ``out`` the number of each point's voxel in a box of ``spans`` (3,) voxels."""
-    for k in range(len(these)):
+def number(first, last, x, these, side, least, spans, out):
+    """Write to ``out`` the number of some points' voxels in a box of ``spans`` (3,) voxels."""
+    for k in range(first, last):
         n = np.int64(0)
         for a in range(3):
             c = np.int64(np.floor(x[these[k], a] / side))
@@ -59,9 +59,9 @@ def sort_by(bins, count, order):
 
 
 @kernel
-def moments(order, begins, x, w, weight, mean, spread):
-    """Fill weight, mean and scatter of every run of points, each of which ends where one begins."""
-    for j in range(len(weight)):
+def moments(first, last, order, begins, x, w, weight, mean, spread):
+    """Fill weight, mean and scatter of some runs of points; each ends where the next begins."""
+    for j in range(first, last):
         total = m0 = m1 = m2 = 0.0
         for i in order[begins[j] : begins[j + 1]]:
             total += w[i]

@@ -63,6 +63,13 @@ class Workers:
             return list(map(function, *items))
         return list(self._pool.map(function, *items))
 
+    def over(self, count: int, kernel: Callable[..., None], *arguments: Any) -> None:
+        """Let a kernel go over ``count`` things, some in each thread.
+
+        It is called with the first and the one past the last, then the arguments.
+        """
+        self.map(lambda band: kernel(*band, *arguments), self.bands(count))
+
     @staticmethod
     def _stoppable(function: Callable[..., T], cancel: Callable[[], bool]) -> Callable[..., T]:
         def guarded(*arguments: Any) -> T:
