@@ -204,8 +204,8 @@ def _voxels(
     views, patch = views[count[patch] >= SEVERAL], patch[count[patch] >= SEVERAL]
     used = np.flatnonzero(count >= SEVERAL)
     sizes = np.diff(begins)[views]
-    ends = np.cumsum(sizes)
-    taken = order[np.repeat(begins[views] - (ends - sizes), sizes) + np.arange(sizes.sum())]
+    taken = np.empty(sizes.sum(), np.int64)
+    laying_kernels.runs(order, begins, views, taken)
     rest = np.zeros(len(x), bool)
     rest[these] = True
     rest[taken] = False

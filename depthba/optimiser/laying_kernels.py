@@ -84,3 +84,13 @@ def moments(first, last, order, begins, x, w, weight, mean, spread):
         spread[j, 0, 1] = spread[j, 1, 0] = s10
         spread[j, 0, 2] = spread[j, 2, 0] = s20
         spread[j, 1, 2] = spread[j, 2, 1] = s21
+
+
+@kernel
+def runs(order, begins, these, out):
+    """Write to ``out`` the points of some runs, one run after the other."""
+    k = 0
+    for j in these:
+        for i in order[begins[j] : begins[j + 1]]:
+            out[k] = i
+            k += 1
