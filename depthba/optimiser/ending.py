@@ -22,8 +22,8 @@ from depthba.optimiser.problem import Problem
 AGAIN = 12
 # Residuals more alike than this many times what independent ones would be are the map's to blame
 # for, too, which has one height per node. Patches beside it then count so many times, from one
-# settling to the next, for as long as that leaves residuals less alike, and as before once it does
-# not: less before the poses have settled, since patches hold what they tie.
+# settling to the next, for as long as that leaves residuals less alike; where it does not, they go
+# back by one. They count once until the poses have settled, since patches hold what they tie.
 ALIKE = 1.5
 EMPHASIS = (1.0, 1.0, 4.0, 16.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
@@ -176,10 +176,10 @@ class _Course:
         finer = engine.finer(level.grid.spacing, known, outcome)
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
-        # a pattern may be what keeps the poses from settling
         change = self._change(known.overall) if level.tied else 0
         loose = outcome.sigma < LOOSE * self.sigma
         settled = less or loose or finer < level.grid.spacing
+        # a pattern may be what keeps the poses from settling
         more = change or bent or (outcome.converged and settled)
         self.sigma = outcome.sigma
         if engine.clock.over or not more:
