@@ -116,7 +116,7 @@ def gone_on(engine: Engine, end: End) -> tuple[End, Known | None]:
 
     Returns where that ends, and what is known there if it was found out.
     """
-    course = _Course()
+    course = Course()
     for _ in range(AGAIN):
         there = known_at(engine, end.level, end.outcome.state, end.outcome.loss)
         if course.refuted(end, there):
@@ -136,7 +136,7 @@ def _uncoupled(end: End) -> End:
 
 
 @dataclass
-class _Course:
+class Course:
     """What going on has come by."""
 
     before: _Before | None = None
@@ -176,26 +176,25 @@ class _Course:
         finer = engine.finer(level.grid.spacing, known, outcome)
         less = known.inflation < LESS * end.believed
         bent = _bent(engine, there, outcome.sigma)
-        change = self._change(known.overall) if level.tied else 0
+        recounted = level.tied is not None and self.recount(known.overall)
         loose = outcome.sigma < LOOSE * self.sigma
         settled = less or loose or finer < level.grid.spacing
         # a pattern may be what keeps the poses from settling
-        more = change or bent or (outcome.converged and settled)
+        more = recounted or bent or (outcome.converged and settled)
         self.sigma = outcome.sigma
         if engine.clock.over or not more:
             return None
         # poses that had not settled had made the residuals look more alike than they are
         state, lin, index = outcome.state, outcome.lin, end.index
         # where nothing but the measured poses' weight changes, patches lie as well as they can
-        new = change or bent or loose or finer < level.grid.spacing or engine.doubted
+        new = recounted or bent or loose or finer < level.grid.spacing or engine.doubted
         tied = None if new else outcome.tied
         if bent and there.believed is not None:
             taken = self.trail.next(engine.bend, there.believed.pattern)
             self.before = _on_trial(engine, self.before, end, there, taken)
             level = engine.unbent(level, taken)
             state, lin = engine.map_solved(level, state)
-        if change:
-            self.emphasis, self.firm, self.alike = self.emphasis + change, change < 0, known.overall
+        if recounted:
             engine.emphasis = EMPHASIS[self.emphasis]
         S: NDArray[np.float64] | None = end.S
         if finer < level.grid.spacing:
@@ -204,13 +203,23 @@ class _Course:
             level, state, lin = engine.lay(finer, state.T_map_camera, coarse, True)
         return engine.settle(level, state, lin, index, known, S, tied)
 
-    def _change(self, overall: float) -> int:
-        """Return by how many steps of `EMPHASIS` patches should count more, or less."""
+    def recount(self, overall: float) -> bool:
+        """Let patches count more, or less again; return whether they count otherwise than before.
+
+        ``overall``: how much alike residuals are now.
+        """
         if self.firm or overall <= ALIKE:
-            return 0
+            return False
         if overall < self.alike:
-            return int(self.emphasis < len(EMPHASIS) - 1)
-        return -int(EMPHASIS[self.emphasis] > EMPHASIS[max(self.emphasis - 1, 0)])
+            if self.emphasis == len(EMPHASIS) - 1:
+                return False
+            self.emphasis += 1
+        elif EMPHASIS[self.emphasis] > EMPHASIS[max(self.emphasis - 1, 0)]:
+            self.emphasis, self.firm = self.emphasis - 1, True
+        else:
+            return False
+        self.alike = overall
+        return True
 
 
 def known_at(engine: Engine, level: Level, state: State, loss: Loss) -> Known:

@@ -25,9 +25,6 @@ from depthba.optimiser.workers import Workers
 from depthba.options import Options
 from depthba.result import Iteration
 
-# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the
-# rest is not.
-WIDE = 12.0
 # A level that only leads to the next is left when a step gains less than this share of its cost.
 GAIN = 0.02
 # The last one is, with patches on it, below this share: their points and the map's robust tails
@@ -143,8 +140,8 @@ class Engine:
             if last and index:
                 poses = self._tied(poses, levels[index], known)
             level, state, lin = self.lay(levels[index], poses, before, last)
-            for phase in phases(1 if refining else index, self.preset):
-                if last and phase == phases(1, self.preset)[-1]:
+            for phase in self.preset.phases(1 if refining else index):
+                if last and phase == self.preset.phases(1)[-1]:
                     level = self.patched(level, state, lin)
                 near = reduced.reduce(lin, self.workers, NEAR, self.free)
                 if self.preset.prior and (known is None or known.owed > NEGLIGIBLE):
@@ -152,7 +149,7 @@ class Engine:
                 believed = known.inflation if known else 1.0
                 S = near.S
                 del near  # the map's answers, which take more memory than all points
-                final = last and phase == phases(1, self.preset)[-1] and not level.tied
+                final = last and phase == self.preset.phases(1)[-1] and not level.tied
                 temperature, outcome = self._descend(
                     level, state, lin, S, phase, index, len(levels), known, final
                 )
@@ -188,7 +185,7 @@ class Engine:
             tied: patches to keep.
         """
         level = replace(level, tied=tied) if tied else self.patched(level, state, lin)
-        phase = phases(1, self.preset)[-1]
+        phase = self.preset.phases(1)[-1]
         if S is None or self._guarded:
             S = reduced.reduce(lin, self.workers, NEAR, self.free).S
         temperature, outcome = self._descend(
@@ -338,7 +335,7 @@ class Engine:
         # go on for as long as they may
         step = PASSING**2 * 6 * max(int(self.free.sum()), 1) * variance
         rules = Rules(
-            _scale(self.preset, phase),
+            self.preset.scale(phase),
             self.options.max_iterations,
             settled=self.settled if final else PASSING,
             steady=final and level.tied is not None,
@@ -394,20 +391,3 @@ class Engine:
             level.problem, level.grid, state, level.loss, lin, self.prior, self.free, self.workers,
             self.with_patches(level, state, lin, at),
         )  # fmt: skip
-
-
-def phases(index: int, preset: schedule.Preset) -> tuple[str, ...]:
-    """Return the losses of a level.
-
-    The robust one comes only when the poses have settled under a wide one.
-    """
-    if not preset.robust:
-        return ("quadratic",)
-    return ("quadratic", "robust") if index == 0 else ("robust",)
-
-
-def _scale(preset: schedule.Preset, phase: str) -> float:
-    """Return the robust scale of a phase, in robust standard deviations; 0 without such a loss."""
-    if not preset.robust:
-        return 0.0
-    return preset.robust if phase == "robust" else WIDE

@@ -24,6 +24,9 @@ REACH = 1.5
 ENOUGH = 6
 # A map of fewer nodes than this across is no map.
 FEWEST = 12
+# The robust loss begins this wide, in robust standard deviations: far stray points are checked, the
+# rest is not.
+WIDE = 12.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,21 @@ class Preset:
     """The measured poses enter as residuals."""
     pattern: bool
     """A fixed pattern of the camera is solved for."""
+
+    def phases(self, index: int) -> tuple[str, ...]:
+        """Return the losses of a level.
+
+        The robust one comes only when the poses have settled under a wide one.
+        """
+        if not self.robust:
+            return ("quadratic",)
+        return ("quadratic", "robust") if index == 0 else ("robust",)
+
+    def scale(self, phase: str) -> float:
+        """Return a phase's robust scale, in robust standard deviations; 0 without such a loss."""
+        if not self.robust:
+            return 0.0
+        return self.robust if phase == "robust" else WIDE
 
 
 PRESETS = {
