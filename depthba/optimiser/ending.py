@@ -25,7 +25,7 @@ AGAIN = 12
 # settling to the next, for as long as that leaves residuals less alike; where it does not, they go
 # back by one. They count once until the poses have settled, since patches hold what they tie.
 ALIKE = 1.5
-EMPHASIS = (1.0, 1.0, 4.0, 16.0)
+EMPHASIS = (1.0, 1.0, 4.0, 16.0, 64.0)
 # It goes on when the residuals' inflation has come out below this share of what was believed.
 LESS = 0.8
 # It goes on when residuals have come out below this share of what they were at the last settling:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from depthba.optimiser import certainty, pattern, reduced, schedule
+from depthba.optimiser import certainty, crowding, pattern, reduced, schedule
 from depthba.optimiser.clock import Clock
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.level import Level, level_heights, make_level
@@ -156,10 +156,10 @@ class Engine:
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
-                shown = self._shown(level, outcome)
-                if level.tied or shown.wrong > NOTICEABLE:
+                shown, told = self._shown(level, outcome), self._told(level, outcome)
+                if level.tied or shown.wrong > NOTICEABLE or told.shares:
                     # where the poses have got to, patches lie better and points show their noise
-                    level = self.weighed(level, shown)
+                    level = self.weighed(self.weighed(level, shown), told)
                     return self.settle(level, state, lin, index, known, S)
                 return End(level, outcome, temperature, index, believed, S)
             poses, before = state.T_map_camera, Map(state.heights, level.grid)
@@ -200,8 +200,15 @@ class Engine:
             return ByRange.as_stated()
         return by_range(level.problem, level.grid, outcome.state, outcome.loss, outcome.lin)
 
-    def weighed(self, level: Level, shown: ByRange) -> Level:
-        """Take all points for as noisy as was shown; return the level with its points likewise."""
+    def _told(self, level: Level, outcome: Outcome) -> crowding.Told:
+        """Return what points tell beside those close to them."""
+        if not self.preset.robust or self.clock.over:
+            return crowding.Told()
+        there = outcome.state, outcome.loss, outcome.lin
+        return crowding.told(level.problem, level.grid, *there, self.workers)
+
+    def weighed(self, level: Level, shown: ByRange | crowding.Told) -> Level:
+        """Let all points count as was shown; return the level with its points likewise."""
         self.problem = shown.applied(self.problem)
         return replace(level, problem=shown.applied(level.problem))
 

@@ -40,7 +40,7 @@ class Cloud:
     points: NDArray[np.float32]
     """(n, 3), sensor frame, m."""
     weights: Array
-    """(n,), inverse variance relative to the typical one."""
+    """(n,), inverse variance relative to the typical one, as far as the point counts."""
     frame: NDArray[np.int32]
     """(n,)."""
     source: NDArray[np.int32]
@@ -56,7 +56,7 @@ class Cloud:
         sizes = [len(f) for f in problem.frames]
         return Cloud(
             np.concatenate([f.points for f in problem.frames]),
-            np.concatenate([f.inverse_noise for f in problem.frames]).astype(np.float64) ** 2,
+            np.concatenate([f.share * f.inverse_noise.astype(float) ** 2 for f in problem.frames]),
             np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
             np.concatenate([np.arange(n, dtype=np.int32) for n in sizes]),
             problem.origin,

@@ -11,7 +11,7 @@ from depthba.optimiser.ending import ALIKE, EMPHASIS, Course
     ("alike", "counts"),
     [
         # less alike each time: as often as may be, and no more
-        ([12.0, 4.0, 3.0, 2.9, 2.8], [1, 4, 16, 16, 16]),
+        ([12.0, 4.0, 3.0, 2.9, 2.8], [1, 4, 16, 64, 64]),
         # four times had left them no less alike: as before, for good
         ([12.0, 4.0, 4.1, 3.0, 2.0], [1, 4, 1, 1, 1]),
         ([12.0, 4.0, 3.0, 3.1, 2.0], [1, 4, 16, 4, 4]),
