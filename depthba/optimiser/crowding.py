@@ -26,13 +26,15 @@ Array = NDArray[np.float64]
 
 # Side of a place, in spacings of the points.
 SIDE = 4.0
-# Design effect below which points are taken for independent.
-SLIGHT = 1.1
+# Design effect below which, in places of any size, points are taken for independent.
+SLIGHT = 2.0
 # Larger ones are not believed in full: outlines, where points are few, would outvote the rest.
-MOST = 2.5
+MOST = 1.5
 # Places are told apart by powers of two of how many points they have, up to so many. Fewer places
 # of a size say too little of their own.
 CLASSES, FEWEST = 16, 1000
+# Points that are asked for it, of whole frames.
+ENOUGH = 500_000
 
 
 @dataclass(frozen=True)
@@ -65,20 +67,24 @@ def told(
     """
     ground = Ground(problem, grid, state, loss)
 
-    def of(i: int) -> tuple[NDArray[np.float32], Array]:
-        place, count = places(ground.feet(i).arms, SIDE * problem.spacing)
-        scatter = np.zeros((CLASSES, 5))
-        counting = lin.residuals[i] * lin.weights[i]
-        crowding_kernels.scatter(place, counting, count, scatter)
-        return np.log2(count[place]).astype(np.float32), scatter
+    def sorted_into(i: int) -> tuple[NDArray[np.int32], Array]:
+        return places(ground.feet(i).arms, SIDE * problem.spacing)
 
-    found = workers.map(of, range(len(problem.frames)))
-    sizes, effects = design_effects(sum((scatter for _, scatter in found), np.zeros((CLASSES, 5))))
-    if effects.max() < SLIGHT:
-        return Told()
-    return Told(
-        tuple(np.float32(1.0) / np.interp(n, sizes, effects).astype(np.float32) for n, _ in found)
-    )
+    def scatter(i: int) -> Array:
+        place, count = sorted_into(i)
+        out = np.zeros((CLASSES, 5))
+        crowding_kernels.scatter(place, lin.residuals[i] * lin.weights[i], count, out)
+        return out
+
+    def shares(i: int) -> NDArray[np.float32]:
+        place, count = sorted_into(i)
+        believed = np.minimum(np.interp(np.log2(count[place]), sizes, effects), MOST)
+        return (1.0 / believed).astype(np.float32)
+
+    frames = range(len(problem.frames))
+    stride = max(1, sum(map(len, problem.frames)) // ENOUGH)
+    sizes, effects = design_effects(np.sum(workers.map(scatter, frames[::stride]), axis=0))
+    return Told(tuple(workers.map(shares, frames)) if effects.max() > SLIGHT else ())
 
 
 def design_effects(scatter: Array) -> tuple[Array, Array]:
@@ -90,14 +96,14 @@ def design_effects(scatter: Array) -> tuple[Array, Array]:
         scatter: (CLASSES, 5), see :func:`crowding_kernels.scatter`.
 
     Returns:
-        (k,), logarithms to base 2 of numbers of points, ascending, and (k,) factors, 1 to `MOST`.
+        (k,), logarithms to base 2 of numbers of points, ascending, and (k,) factors, at least 1.
     """
     number, n, size, together, alone = scatter.T
     used = number >= FEWEST
     if not used.any() or not alone.any():
         return np.zeros(1), np.ones(1)
     effects = together[used] / n[used] / (alone.sum() / n.sum())
-    return size[used] / n[used], np.clip(effects, 1.0, MOST)
+    return size[used] / n[used], np.maximum(effects, 1.0)
 
 
 def places(points: Array, side: float) -> tuple[NDArray[np.int32], Array]:
