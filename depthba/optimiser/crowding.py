@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 SIDE = 4.0
 # Design effect below which, in places of any size, points are taken for independent.
 SLIGHT = 2.0
-# Larger ones are not believed in full: outlines, where points are few, would outvote the rest.
+# Larger ones are not believed in full: chosen by trial, see docs/optimiser.md.
 MOST = 1.5
 # Places are told apart by powers of two of how many points they have, up to so many. Fewer places
 # of a size say too little of their own.
