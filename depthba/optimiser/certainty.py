@@ -76,7 +76,7 @@ def correlation(
     if not keep.any():
         return Correlation(1.0, 1.0, S, 0.0, np.zeros((1, len(S))))
     inner = firm(S[np.ix_(keep, keep)])
-    P = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
+    P = prior.at(state.T_map_camera).normal_equations(lin.pivots)[0][np.ix_(keep, keep)]
     count = BLOCKS[0] * BLOCKS[1]
     rng = np.random.default_rng(0)
     random = tuple(rng.integers(0, count, len(f)).astype(np.uint8) for f in problem.frames)
@@ -254,7 +254,7 @@ def assess(
     keep = np.repeat(free, 6)
     J = about_pivot(state.T_map_camera, lin.pivots)
     data = S[np.ix_(keep, keep)] / max(variance, 1e-30)
-    held = prior.normal_equations(state.T_map_camera, lin.pivots)[0][np.ix_(keep, keep)]
+    held = prior.at(state.T_map_camera).normal_equations(lin.pivots)[0][np.ix_(keep, keep)]
     posterior = dense.inverse(data + held)
     careful = posterior if doubt == 1.0 else dense.inverse(data / doubt + held)
     if known is not None and keep.any():

@@ -53,11 +53,11 @@ def conclude(
         outcome.loss, level.smooth, workers, ROUNDS, TOLERANCE,
     )  # fmt: skip
     began_lin, acting = began_lin.uncoupled(), engine.acting
-    cost_start = began_lin.cost + end.temperature * acting.cost(T_camera_start)
+    cost_start = began_lin.cost + end.temperature * acting.at(T_camera_start).cost
     cost_end = linearise(
         level.problem, level.grid, outcome.state, outcome.loss, workers, level.smooth
     ).cost
-    cost_end += end.temperature * acting.cost(outcome.state.T_map_camera)
+    cost_end += end.temperature * acting.at(outcome.state.T_map_camera).cost
     if outcome.tied is not None:
         cost_start += outcome.tied.patches.fitted(T_camera_start, workers).cost
         cost_end += outcome.tied.cost
@@ -72,7 +72,8 @@ def conclude(
     # where no point may vouch for the map, all must; and none is better than its last digit
     sigma = max(sigma or robust_sigma(lin.residuals), problem.rounding)
     variance, inflation = correlation.inflation * sigma**2, found.inflation
-    held_by_prior = prior.normal_equations(state.T_map_camera, firm_lin.pivots)[0]
+    prior_there = prior.at(state.T_map_camera)
+    held_by_prior = prior_there.normal_equations(firm_lin.pivots)[0]
     S, _ = without_slope_noise(
         firm, level.grid, state, outcome.loss, firm_lin, correlation.S, variance * held_by_prior,
         engine.free, workers, sigma,
@@ -83,7 +84,7 @@ def conclude(
     )  # fmt: skip
     engine.clock.lap("certainty")
     frames = frame_reports(ids, problem, state, lin, held, overlap)
-    gone = astray(ids, prior.distances(state.T_map_camera), engine.preset.prior, stated)
+    gone = astray(ids, prior_there.distances, engine.preset.prior, stated)
     gone += misfits(frames) if better and engine.preset.robust else []
     status, reason = verdict(outcome, better, judged, frames, gone, engine.clock)
     T_world_map = se3.inverse(problem.T_map_world)

@@ -256,7 +256,7 @@ def _believed(
     variance = robust_sigma(lin.residuals) ** 2
     if not variance:  # no point is left to ask: the map bends sharply everywhere
         return None
-    matrix, _ = engine.acting.normal_equations(state.T_map_camera, lin.pivots)
+    matrix, _ = engine.acting.at(state.T_map_camera).normal_equations(lin.pivots)
     found = pattern.answers(problem, level.grid, state, loss, lin, at, waves, engine.workers)
     if level.tied:
         poses, patches = state.T_map_camera, level.tied.patches

@@ -378,7 +378,7 @@ class Engine:
         """Return what of S is not noise in the map's slope; None where that is next to all."""
         if not self._guarded:
             return None
-        matrix, _ = self.prior.normal_equations(state.T_map_camera, lin.pivots)
+        matrix, _ = self.prior.at(state.T_map_camera).normal_equations(lin.pivots)
         held = temperature * matrix
         if level.tied is not None:
             patches = level.tied.patches

@@ -100,11 +100,16 @@ def lay(
         parts.append(_voxels(x, cloud, T_map_camera[:, :3, 3], left, side, workers))
         left = parts[-1].left
     order = np.concatenate([p.points for p in parts])
+    taken = np.empty((len(order), 3), np.float32), np.empty(len(order)), np.empty(len(order), np.int32)
+    workers.over(
+        len(order), laying_kernels.gather, order, cloud.points, cloud.weights, cloud.source, *taken
+    )
+    points, weights, source = taken
     each = np.repeat(sides, [len(p.centre) for p in parts])
     laid = Patches(
-        points=cloud.points[order],
-        weights=cloud.weights[order],
-        source=cloud.source[order],
+        points=points,
+        weights=weights,
+        source=source,
         ends=_ends([p.sizes for p in parts]),
         frame=np.concatenate([p.frame for p in parts]),
         views=_ends([p.views for p in parts]),
@@ -161,17 +166,15 @@ def _voxels(
         return _Found(
             none, none, none.astype(np.int32), none, np.empty((0, 3, 3)), np.empty((0, 3)), these
         )
-    voxel, k = _voxel_of(x, these, side, workers)
-    order = np.empty_like(these)
-    laying_kernels.sort_by(voxel, k, order)
+    key, k = _voxel_of(x, these, side, workers)
+    order, ends = np.empty_like(these), np.zeros(k + 1, np.int64)
+    laying_kernels.sort_by(key, these, order, ends)
     look()
-    voxel, order = voxel[order], these[order]
-    frame = cloud.frame[order]
-    new = (voxel[1:] != voxel[:-1]) | (frame[1:] != frame[:-1])
-    begins = np.flatnonzero(np.concatenate([[True], new]))
-    voxel, frame = voxel[begins], frame[begins]
-    begins = np.append(begins, len(order))
-    m = len(frame)
+    begins, voxel = np.empty(len(order) + 1, np.int64), np.empty(len(order), np.int64)
+    m, k = laying_kernels.split(order, ends, cloud.frame, begins, voxel)
+    begins[m] = len(order)
+    begins, voxel = begins[: m + 1], voxel[:m]
+    frame = cloud.frame[order[begins[:-1]]]
     weight, mean, spread = np.empty(m), np.empty((m, 3)), np.empty((m, 3, 3))
     workers.over(m, laying_kernels.moments, order, begins, x, cloud.weights, weight, mean, spread)
     look()
@@ -181,15 +184,16 @@ def _voxels(
     # from here on of the voxels that several frames see
     on, k = (np.cumsum(several) - 1)[voxel[many]], int(several.sum())
     total, pooled = np.bincount(on, weight[many], k), np.zeros((k, 3, 3))
-    np.add.at(pooled, on, spread[many])
+    laying_kernels.pool(on, spread[many], pooled)
     values, axes = np.empty((k, 3)), np.empty((k, 3, 3))
 
     def decompose(first: int, last: int) -> None:
-        values[first:last], axes[first:last] = np.linalg.eigh(pooled[first:last])
+        values[first:last], found = np.linalg.eigh(pooled[first:last])
+        found[:, :, 2] *= np.sign(np.linalg.det(found))[:, None]
+        axes[first:last] = found
 
     workers.over(k, decompose)
     good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
-    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     views = np.flatnonzero(many)[good[on]]
     patch = on[good[on]]
     if cloud.sided:
@@ -228,13 +232,20 @@ def _means(group: Ints, weight: Array, mean: Array, count: int) -> Array:
 
 
 def _voxel_of(x: Array, these: Ints, side: float, workers: Workers) -> tuple[Ints, int]:
-    """Return the voxel of some points, numbered in order without gaps, and how many there are."""
-    least, most = np.empty(3, np.int64), np.empty(3, np.int64)
-    laying_kernels.extent(x, these, side, least, most)
-    key, spans = np.empty_like(these), most - least + 1
+    """Return the number of some points' voxels, in order, and one more than the last."""
+
+    def extent(band: tuple[int, int]) -> tuple[Array, Array]:
+        least, most = np.empty(3), np.empty(3)
+        laying_kernels.extent(*band, x, these, least, most)
+        return least, most
+
+    extents = np.array(workers.map(extent, workers.bands(len(these))))
+    least = np.floor(extents[:, 0].min(axis=0) / side).astype(np.int64)
+    spans = np.floor(extents[:, 1].max(axis=0) / side).astype(np.int64) + 1 - least
+    key = np.empty_like(these)
     workers.over(len(key), laying_kernels.number, x, these, side, least, spans, key)
-    if float(np.prod(spans.astype(float))) > SPARSE * len(key):
-        used, numbers = np.unique(key, return_inverse=True)
-        return numbers, len(used)
-    there = np.bincount(key) > 0
-    return (np.cumsum(there) - 1)[key], int(there.sum())
+    count = float(np.prod(spans.astype(float)))
+    if count <= SPARSE * len(key):
+        return key, int(count)
+    used, numbers = np.unique(key, return_inverse=True)
+    return numbers, len(used)

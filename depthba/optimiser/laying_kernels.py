@@ -23,15 +23,13 @@ def to_map(first, last, points, frame, T, out):
 
 
 @kernel
-def extent(x, these, side, least, most):
-    """Fill ``least`` and ``most`` (3,) with the first and the last voxel of some points."""
-    for a in range(3):
-        least[a] = most[a] = np.int64(np.floor(x[these[0], a] / side))
-    for i in these:
+def extent(first, last, x, these, least, most):
+    """Fill ``least`` and ``most`` (3,) with the first and the last coordinate of some points."""
+    least[:], most[:] = np.inf, -np.inf
+    for k in range(first, last):
         for a in range(3):
-            c = np.int64(np.floor(x[i, a] / side))
-            least[a] = min(least[a], c)
-            most[a] = max(most[a], c)
+            least[a] = min(least[a], x[these[k], a])
+            most[a] = max(most[a], x[these[k], a])
 
 
 @kernel
@@ -46,16 +44,40 @@ def number(first, last, x, these, side, least, spans, out):
 
 
 @kernel
-def sort_by(bins, count, order):
-    """Write to ``order`` (n,) the points sorted by bin; the sort is stable."""
-    at = np.zeros(count + 1, np.int64)
+def sort_by(bins, these, order, at):
+    """Write to ``order`` (n,) some points sorted by bin; ``at`` (bins + 1,): zeros.
+
+    The sort is stable. Afterwards a bin begins where ``at`` has it.
+    """
     for k in bins:
         at[k + 1] += 1
-    for k in range(count):
+    for k in range(len(at) - 1):
         at[k + 1] += at[k]
     for i in range(len(bins)):
-        order[at[bins[i]]] = i
+        order[at[bins[i]]] = these[i]
         at[bins[i]] += 1
+
+
+@kernel
+def split(order, at, frame, begins, voxel):
+    """Split points that are sorted by bin, each of which ends where ``at`` has it, by frame.
+
+    Fills where each run begins, and the number of its bin, those without points left out; returns
+    how many runs and how many bins there are.
+    """
+    runs, bins, i = 0, 0, 0
+    for end in at[:-1]:
+        if i == end:
+            continue
+        before = -1
+        while i < end:
+            now = frame[order[i]]
+            if now != before:
+                begins[runs], voxel[runs], before = i, bins, now
+                runs += 1
+            i += 1
+        bins += 1
+    return runs, bins
 
 
 @kernel
@@ -94,3 +116,22 @@ def runs(order, begins, these, out):
         for i in order[begins[j] : begins[j + 1]]:
             out[k] = i
             k += 1
+
+
+@kernel
+def pool(group, spread, out):
+    """Add the scatter (n, 3, 3) of each run to its group's in ``out`` (k, 3, 3)."""
+    for j in range(len(group)):
+        for a in range(3):
+            for b in range(3):
+                out[group[j], a, b] += spread[j, a, b]
+
+
+@kernel
+def gather(first, last, order, points, weights, source, points_out, weights_out, source_out):
+    """Take the points of an order, with all that is known of them."""
+    for k in range(first, last):
+        i = order[k]
+        for a in range(3):
+            points_out[k, a] = points[i, a]
+        weights_out[k], source_out[k] = weights[i], source[i]

@@ -39,46 +39,17 @@ class PosePrior:
     """(6, 6), inverse covariance of the hand-eye transform's error, camera axes; None: it has none,
     as where frame 0 has none."""
 
-    def distances(self, T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (N,) by how many stated deviations each pose is off, over all six directions."""
-        e = self._errors(T_map_camera)[0]
-        return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", e, self.information, e)))
+    @property
+    def shared(self) -> bool:
+        """Whether frame 0's own error is found."""
+        return self.gauge is not None and bool(self.information.any())
 
-    def cost(self, T_map_camera: NDArray[np.float64]) -> float:
-        """Return the sum of squared normalised errors, the gauge's own included."""
-        e, _, _, paid = self._errors(T_map_camera)
-        return paid + float(np.einsum("ni,nij,nj->", e, self.information, e))
-
-    def normal_equations(
-        self, T_map_camera: NDArray[np.float64], pivots: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the matrix (6N, 6N) and gradient (N, 6) in perturbations about the pivots (N, 3).
-
-        The gauge is eliminated. The derivative of the rotation's logarithm is taken as the
-        identity: its error is of second order in an angle that is small wherever the prior matters.
-        """
-        e, turn, K, _ = self._errors(T_map_camera)
-        J = np.kron(np.eye(2), turn) @ about_pivot(T_map_camera, pivots)
-        weighted = np.einsum("nji,njk->nik", J, self.information)
-        look()
-        matrix = block_diag(*(weighted @ J))
-        if self.gauge is not None and self.information.any():
-            U = (weighted @ K).reshape(matrix.shape[0], -1)
-            look()
-            matrix -= U @ self._inverse(K) @ U.T
-        return matrix, np.einsum("nij,nj->ni", weighted, e)
-
-    def _errors(
-        self, T_map_camera: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Return the errors (N, 6), the gauge's rotation, Jacobians (N, 6, m) and what is paid.
-
-        The Jacobians are by what all frames share: the gauge (6), then the hand-eye error (6) if
-        there is one.
-        """
-        if self.gauge is None or not self.information.any():
+    def at(self, T_map_camera: NDArray[np.float64]) -> PriorAt:
+        """Return where poses (N, 4, 4) stand: the errors that cost least."""
+        if not self.shared:
             K = np.zeros((len(T_map_camera), 6, 6))
-            return se3.difference(T_map_camera, self.T_map_camera), np.eye(3), K, 0.0
+            e = se3.difference(T_map_camera, self.T_map_camera)
+            return PriorAt(self, T_map_camera, e, np.eye(3), K, 0.0)
         G, x = np.eye(4)[None], np.zeros(6)
         for k in range(ROUNDS + 1):
             measured = self.T_map_camera @ se3.make(se3.exp_so3(x[3:]), x[:3])
@@ -95,20 +66,20 @@ class PosePrior:
             b += self._of_first(K).T @ self.gauge @ own
             if self.hand_eye is not None:
                 b[6:] += self.hand_eye @ x
-            step = -self._inverse(K) @ b
+            step = -self.inverse(K) @ b
             G = move(G, centre, step[None, :6])
             if self.hand_eye is not None:
                 x = x + step[6:]
         paid = float(own @ self.gauge @ own)
         if self.hand_eye is not None:
             paid += float(x @ self.hand_eye @ x)
-        return e, G[0, :3, :3], K, paid
+        return PriorAt(self, T_map_camera, e, G[0, :3, :3], K, paid)
 
     def _of_first(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (6, m), the derivative of frame 0's own error."""
         return np.concatenate([np.eye(6), K[0, :, 6:]], axis=1)
 
-    def _inverse(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inverse(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the inverse (m, m) of what holds the motions that all frames share."""
         first = self._of_first(K)
         assert self.gauge is not None  # else nothing is shared
@@ -119,6 +90,54 @@ class PosePrior:
         return np.asarray(np.linalg.pinv(H * np.outer(own, own), hermitian=True)) * np.outer(
             own, own
         )
+
+
+@dataclass(frozen=True)
+class PriorAt:
+    """A prior at some poses."""
+
+    prior: PosePrior
+    T_map_camera: NDArray[np.float64]
+    """(N, 4, 4)."""
+    errors: NDArray[np.float64]
+    """(N, 6)."""
+    turn: NDArray[np.float64]
+    """(3, 3), the gauge's rotation."""
+    K: NDArray[np.float64]
+    """(N, 6, m), Jacobians by what all frames share: the gauge (6), then the hand-eye error (6) if
+    there is one."""
+    paid: float
+    """For what all frames share."""
+
+    @property
+    def distances(self) -> NDArray[np.float64]:
+        """(N,) by how many stated deviations each pose is off, over all six directions."""
+        e = self.errors
+        return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", e, self.prior.information, e)))
+
+    @property
+    def cost(self) -> float:
+        """The sum of squared normalised errors, the gauge's own included."""
+        e = self.errors
+        return self.paid + float(np.einsum("ni,nij,nj->", e, self.prior.information, e))
+
+    def normal_equations(
+        self, pivots: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the matrix (6N, 6N) and gradient (N, 6) in perturbations about the pivots (N, 3).
+
+        The gauge is eliminated. The derivative of the rotation's logarithm is taken as the
+        identity: its error is of second order in an angle that is small wherever the prior matters.
+        """
+        J = np.kron(np.eye(2), self.turn) @ about_pivot(self.T_map_camera, pivots)
+        weighted = np.einsum("nji,njk->nik", J, self.prior.information)
+        look()
+        matrix = block_diag(*(weighted @ J))
+        if self.prior.shared:
+            U = (weighted @ self.K).reshape(matrix.shape[0], -1)
+            look()
+            matrix -= U @ self.prior.inverse(self.K) @ U.T
+        return matrix, np.einsum("nij,nj->ni", weighted, self.errors)
 
 
 def pose_prior(

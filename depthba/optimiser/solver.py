@@ -20,7 +20,7 @@ from depthba.optimiser.linearise import Linearisation, Loss, State, linearise, r
 from depthba.optimiser.map_solver import MapSolver
 from depthba.optimiser.mixing import Mixer
 from depthba.optimiser.patches import Fit
-from depthba.optimiser.prior import PosePrior, move
+from depthba.optimiser.prior import PosePrior, PriorAt, move
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import Workers
 
@@ -150,10 +150,11 @@ def solve_level(
         tied: patches that tie the frames beside the map, fitted where the level starts.
     """
 
-    def beside(T_map_camera: NDArray[np.float64]) -> tuple[float, Fit | None]:
-        """Return what poses cost beside the map, m^2, and the patches there."""
+    def beside(T_map_camera: NDArray[np.float64]) -> tuple[float, PriorAt, Fit | None]:
+        """Return what poses cost beside the map, m^2, and what the prior and patches say there."""
         fit = None if tied is None else tied.patches.fitted(T_map_camera, workers)
-        return temperature * prior.cost(T_map_camera) + (fit.cost if fit else 0.0), fit
+        at = prior.at(T_map_camera)
+        return temperature * at.cost + (fit.cost if fit else 0.0), at, fit
 
     sigma = robust_sigma(lin.residuals)
     loss = judge = _rescaled(loss, rules, sigma)
@@ -166,11 +167,12 @@ def solve_level(
     unlearnt = 0.0 if sure is None else dof * max(temperature, sigma**2)
     mixer, pace, previous = Mixer(), PACE, np.inf
     recent: list[float] = []
+    held_at = prior.at(state.T_map_camera)
     gained = 1.0
     for count in range(rules.limit):
         if count and over():
             break
-        matrix, gradient = prior.normal_equations(state.T_map_camera, lin.pivots)
+        matrix, gradient = held_at.normal_equations(lin.pivots)
         believed = temperature * matrix, temperature * gradient
         told = None
         if tied is not None:
@@ -191,7 +193,7 @@ def solve_level(
             move(state.T_map_camera, lin.pivots, mixed.pose), state.heights + mixed.map
         )
         after = linearise(problem, grid, candidate, loss, workers, smooth, judge, spare)
-        before_cost = lin.cost + temperature * prior.cost(state.T_map_camera)
+        before_cost = lin.cost + temperature * held_at.cost
         before_cost += tied.cost if tied else 0.0
         # steps that shrink by the same factor leave a geometric series to go
         left = length * pace / (1 - pace)
@@ -199,7 +201,7 @@ def solve_level(
         small = left < rules.settled * deviation
         # with the nodal gradient the cost may rise in the last digits while the poses still settle
         most = before_cost * (1 + (1e-3 if small else 1e-6)) + unlearnt
-        aside, fit = beside(candidate.T_map_camera)
+        aside, at, fit = beside(candidate.T_map_camera)
         after_cost = after.judged + aside
         for _ in range(FOLLOW):
             if after_cost <= most:
@@ -216,7 +218,7 @@ def solve_level(
             heights = state.heights + share * mixed.map
             candidate = State(move(state.T_map_camera, lin.pivots, share * mixed.pose), heights)
             after = linearise(problem, grid, candidate, loss, workers, smooth, judge, after)
-            aside, fit = beside(candidate.T_map_camera)
+            aside, at, fit = beside(candidate.T_map_camera)
             after_cost = after.judged + aside
         # points that change cells or fall off edges make the cost rough on a small scale: what the
         # last steps gained may be spent on getting over that (Grippo, Lampariello & Lucidi 1986)
@@ -235,7 +237,7 @@ def solve_level(
                     loss, rules, min(sigma, loss.robust_c / rules.robust) if rules.robust else sigma
                 )
             damping = damping / 10 if damping > 1e-3 else 0.0
-            tied = fit
+            held_at, tied = at, fit
         else:
             spare = after
             if mixed is step:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from depthba.optimiser.layers import rough_points
 from depthba.optimiser.laying import Cloud, lay
 from depthba.optimiser.patches import Fit
-from depthba.optimiser.prior import PosePrior, move
+from depthba.optimiser.prior import PosePrior, PriorAt, move
 from depthba.optimiser.problem import Problem
 from depthba.optimiser.workers import Workers
 
@@ -97,28 +97,30 @@ def _settled(
     keep, damping = np.repeat(free, 6), 0.0
     variance = inflation * (tied.patches.deviation) ** 2
 
-    def held(T: Array) -> float:
-        return variance * sum(p.cost(T) for p in priors)
+    def held_at(T: Array) -> list[PriorAt]:
+        return [p.at(T) for p in priors]
 
+    held = held_at(poses)
     for _ in range(STEPS):
         pivots = np.einsum("nij,nj->ni", poses[:, :3, :3], centroids) + poses[:, :3, 3]
         A, g = tied.patches.normal_equations(poses, pivots, workers)
-        for p in priors:
-            matrix, gradient = p.normal_equations(poses, pivots)
+        for at in held:
+            matrix, gradient = at.normal_equations(pivots)
             A, g = A + variance * matrix, g + variance * gradient
-        before = tied.cost + held(poses)
+        before = tied.cost + variance * sum(at.cost for at in held)
         A = A[np.ix_(keep, keep)]
         step = np.zeros(len(keep))
         x = -np.linalg.solve(A + np.diag((1e-9 + damping) * np.diag(A)), g.ravel()[keep])
         step[keep] = x
         candidate = move(poses, pivots, step.reshape(-1, 6))
         fit = tied.patches.fitted(candidate, workers)
-        after = fit.cost + held(candidate)
+        held_there = held_at(candidate)
+        after = fit.cost + variance * sum(at.cost for at in held_there)
         if after > before * (1 + 1e-6):
             damping = max(10 * damping, 1e-3)
             continue
         poses, damping = candidate, damping / 10 if damping > 1e-4 else 0.0
-        tied = fit
+        tied, held = fit, held_there
         if x @ A @ x < SETTLED**2 * len(x) * variance:
             break
     return poses

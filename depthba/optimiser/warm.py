@@ -34,7 +34,7 @@ def warm() -> None:
     free = np.array([False, True])
     prior = pose_prior(T, np.eye(3), np.ones(3), np.ones(3), ~free)
     certainty.correlation(problem, grid, state, loss, lin, prior, free, workers)
-    eliminate.solve(lin, free, prior.normal_equations(T, lin.pivots), 0.0, workers, 1e-2, 12)
+    eliminate.solve(lin, free, prior.at(T).normal_equations(lin.pivots), 0.0, workers, 1e-2, 12)
 
 
 if __name__ == "__main__":

@@ -174,13 +174,13 @@ def test_prior_normal_equations(isotropic: bool, on_arm: bool) -> None:
     measured, pivots, prior = some_prior(isotropic, on_arm)
     rng = np.random.default_rng(3)
     T = se3.retract(measured, rng.normal(scale=0.003, size=(5, 6)))
-    matrix, gradient = prior.normal_equations(T, pivots)
+    matrix, gradient = prior.at(T).normal_equations(pivots)
 
     def cost(delta: Floats) -> Floats:
         poses = np.repeat(T[None], 5, axis=0)
         for i in range(5):
             poses[i, i] = move(T[i : i + 1], pivots[i : i + 1], delta[None])[0]
-        return np.array([prior.cost(p) for p in poses])
+        return np.array([prior.at(p).cost for p in poses])
 
     numeric = derivative(cost, 1e-6) / 2
     # the logarithm's derivative is taken as the identity, which isotropic rotations about one place
@@ -201,7 +201,7 @@ def test_prior_knows_what_the_frames_share() -> None:
     carried = about_pivot(measured, measured[:1, :3, 3])[1:].reshape(-1, 6)
     want = block_diag(*np.linalg.inv(prior.information[1:]))
     want = want + carried @ np.linalg.inv(prior.gauge) @ carried.T
-    about_centres = prior.normal_equations(measured, measured[:, :3, 3])[0][6:, 6:]
+    about_centres = prior.at(measured).normal_equations(measured[:, :3, 3])[0][6:, 6:]
     np.testing.assert_allclose(
         np.linalg.inv(about_centres), want, rtol=1e-6, atol=1e-9 * np.abs(want).max()
     )
@@ -218,7 +218,7 @@ def test_prior_knows_that_the_frames_share_a_hand_eye_transform() -> None:
     carried = carried.reshape(-1, 6)
     want = want + carried @ np.linalg.inv(prior.gauge) @ carried.T
     want = want + shared @ np.linalg.inv(prior.hand_eye) @ shared.T
-    about_centres = prior.normal_equations(measured, measured[:, :3, 3])[0][6:, 6:]
+    about_centres = prior.at(measured).normal_equations(measured[:, :3, 3])[0][6:, 6:]
     np.testing.assert_allclose(
         np.linalg.inv(about_centres), want, rtol=1e-6, atol=1e-9 * np.abs(want).max()
     )
@@ -232,8 +232,8 @@ def test_a_wrong_hand_eye_transform_costs_once_and_not_by_frame() -> None:
     wrong = se3.make(se3.exp_so3([0.02, -0.01, 0.015]), [0.01, 0.02, -0.02])
     poses = measured @ wrong
     poses = measured[0] @ np.linalg.inv(poses[0]) @ poses
-    assert prior.cost(poses) < 4.0
-    assert replace(prior, hand_eye=None).cost(poses) > 20.0
+    assert prior.at(poses).cost < 4.0
+    assert replace(prior, hand_eye=None).at(poses).cost > 20.0
 
 
 def test_prior_lets_frame_0_pay_for_what_all_frames_share() -> None:
@@ -243,8 +243,8 @@ def test_prior_lets_frame_0_pay_for_what_all_frames_share() -> None:
     turned[0] = measured[0]
     assert prior.gauge is not None
     alone = float(slip[0] @ prior.gauge @ slip[0])
-    assert 0.5 * alone < prior.cost(turned) <= alone * (1 + 1e-9)
-    assert replace(prior, gauge=None).cost(turned) > 3 * alone
+    assert 0.5 * alone < prior.at(turned).cost <= alone * (1 + 1e-9)
+    assert replace(prior, gauge=None).at(turned).cost > 3 * alone
 
 
 def test_prior_is_in_world_axes() -> None:
@@ -255,7 +255,7 @@ def test_prior_is_in_world_axes() -> None:
         delta[:, 3 * (k // 3) : 3 * (k // 3) + 3] = 3 * sigma * R_map_world[:, k % 3]
         # frame 0 has none
         alone = replace(prior, gauge=None)
-        assert alone.cost(se3.retract(measured, delta)) == pytest.approx(4 * 9, rel=1e-6)
+        assert alone.at(se3.retract(measured, delta)).cost == pytest.approx(4 * 9, rel=1e-6)
 
 
 def test_move_is_about_the_pivot() -> None:
