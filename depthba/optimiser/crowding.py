@@ -19,7 +19,7 @@ from depthba.optimiser.asking import look
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
-from depthba.optimiser.problem import Problem
+from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.workers import Workers
 
 Array = NDArray[np.float64]
@@ -44,12 +44,15 @@ class Told:
     shares: tuple[NDArray[np.float32], ...] = ()
     """(n,) of each frame, of what they would tell alone; empty: all of it."""
 
-    def applied(self, problem: Problem) -> Problem:
+    def applied(self, problem: Problem, workers: Workers) -> Problem:
         """Return the problem with its points counting so much."""
         if not self.shares:
             return problem
-        pairs = zip(problem.frames, self.shares, strict=True)
-        return replace(problem, frames=tuple(replace(f, share=f.share * s) for f, s in pairs))
+
+        def counting(frame: FramePoints, share: NDArray[np.float32]) -> FramePoints:
+            return replace(frame, share=frame.share * share)
+
+        return replace(problem, frames=tuple(workers.map(counting, problem.frames, self.shares)))
 
 
 def told(

@@ -209,8 +209,8 @@ class Engine:
 
     def weighed(self, level: Level, shown: ByRange | crowding.Told) -> Level:
         """Let all points count as was shown; return the level with its points likewise."""
-        self.problem = shown.applied(self.problem)
-        return replace(level, problem=shown.applied(level.problem))
+        self.problem = shown.applied(self.problem, self.workers)
+        return replace(level, problem=shown.applied(level.problem, self.workers))
 
     def unbent(self, level: Level, bend: NDArray[np.float64]) -> Level:
         """Take the camera's fixed pattern (m,) off all points, in place of the present one.
@@ -225,10 +225,10 @@ class Engine:
         self, spacing: float, poses: NDArray[np.float64], before: Map | None, last: bool
     ) -> tuple[Level, State, Linearisation]:
         """Return a level, and its map solved for the poses."""
-        level = make_level(self.problem, poses, spacing, self.preset, self.options, last)
-        heights = level_heights(
-            level, before.heights if before else None, before.grid if before else None
+        level = make_level(
+            self.problem, poses, spacing, self.preset, self.options, self.workers, last
         )
+        heights = level_heights(level, *((before.heights, before.grid) if before else (None, None)))
         return level, *self.map_solved(level, State(poses, heights))
 
     def map_solved(self, level: Level, state: State) -> tuple[State, Linearisation]:

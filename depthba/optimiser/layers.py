@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from depthba.optimiser import map_kernels
 from depthba.optimiser.asking import look
 from depthba.optimiser.grid import Grid, average, filled, make_grid
-from depthba.optimiser.problem import Problem
+from depthba.optimiser.problem import FramePoints, Problem
+from depthba.optimiser.workers import SHARES, Workers
 
 # Scatter within a cell is measured on cells this many times the spacing of the points: fewer points
 # say nothing.
@@ -22,7 +23,9 @@ COARSEST = 3.0
 USUAL = 4.0
 
 
-def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: float) -> Problem:
+def down_weighted(
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float, workers: Workers
+) -> Problem:
     """Return the problem with the points of rough cells taken for as noisy as they are.
 
     Fixed for the level.
@@ -32,43 +35,45 @@ def down_weighted(problem: Problem, T_map_camera: NDArray[np.float64], spacing: 
     point's noise grows with it. The weight hangs on the point, not on the cell: one that changes
     cell keeps it, so nothing is gained by moving.
     """
-    rough, grid = roughness(problem, T_map_camera, spacing)
+    rough, grid = roughness(problem, T_map_camera, spacing, workers)
     if not rough.any():
         return problem
     factor = 1.0 / np.maximum(1.0, rough)
-    frames = []
-    for frame, T in zip(problem.frames, T_map_camera, strict=True):
+
+    def lessened(frame: FramePoints, T: NDArray[np.float64]) -> FramePoints:
         a = _look_up(factor, frame.points, T, grid).astype(np.float32)
         # what a rough cell scatters is not noise but bias: it gets less than the weight of its
         # variance
-        frames.append(
-            replace(frame, inverse_noise=frame.inverse_noise * a, share=frame.share * a**2)
-        )
-    return replace(problem, frames=tuple(frames))
+        return replace(frame, inverse_noise=frame.inverse_noise * a, share=frame.share * a**2)
+
+    return replace(problem, frames=tuple(workers.map(lessened, problem.frames, T_map_camera)))
 
 
 def rough_points(
-    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float, workers: Workers
 ) -> list[NDArray[np.bool_]]:
     """Say of each frame, (n,), which of its points lie in cells that one height cannot describe."""
-    rough, grid = roughness(problem, T_map_camera, spacing)
-    return [
-        _look_up(rough, f.points, T, grid) > 1.0
-        for f, T in zip(problem.frames, T_map_camera, strict=True)
-    ]
+    rough, grid = roughness(problem, T_map_camera, spacing, workers)
+
+    def of(frame: FramePoints, T: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return _look_up(rough, frame.points, T, grid) > 1.0
+
+    return workers.map(of, problem.frames, T_map_camera)
 
 
 def roughness(
-    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float
+    problem: Problem, T_map_camera: NDArray[np.float64], spacing: float, workers: Workers
 ) -> tuple[NDArray[np.float64], Grid]:
     """Return (ny, nx) the scatter within cells over what passes for noise, and the cells."""
     grid = make_grid(problem, max(spacing, COARSEST * problem.spacing), 2 * spacing)
-    rough = scatter(problem, T_map_camera, grid)
+    rough = scatter(problem, T_map_camera, grid, workers)
     typical = float(np.median(rough[rough > 0])) if (rough > 0).any() else 0.0
     return rough / (USUAL * typical) if typical else np.zeros(grid.shape), grid
 
 
-def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
+def scatter(
+    problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid, workers: Workers
+) -> NDArray[np.float64]:
     """Return (ny, nx) the standard deviation within a frame of heights about the averaged map.
 
     Pooled over frames.
@@ -77,16 +82,21 @@ def scatter(problem: Problem, T_map_camera: NDArray[np.float64], grid: Grid) -> 
     heights = filled(average(problem, T_map_camera, grid).heights)
     map_kernels.nodal_rows(heights, grid.spacing, nodes, 0, len(heights))
     squares, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
-    for frame, T in zip(problem.frames, T_map_camera, strict=True):
+
+    def within(i: int) -> NDArray[np.float64]:
         look()
-        total, square, count = (np.zeros(grid.shape) for _ in range(3))
+        T, found = T_map_camera[i], np.zeros((*grid.shape, 3))
         map_kernels.splat_residuals(
-            frame.points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing, nodes,
-            total, square, count,
+            problem.frames[i].points, T[:3, :3].copy(), T[:3, 3].copy(), grid.origin, grid.spacing,
+            nodes, found,
         )  # fmt: skip
-        several = count > 1
-        squares[several] += square[several] - total[several] ** 2 / count[several]
-        freedom[several] += count[several] - 1
+        return found
+
+    # a grid for each frame would take more memory than its points
+    frames = range(len(problem.frames))
+    for some in (frames[k : k + SHARES] for k in frames[::SHARES]):
+        for found in workers.map(within, some):
+            map_kernels.pool_scatter(found, squares, freedom)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(freedom, 1.0)))
 
 

@@ -63,18 +63,23 @@ class Cloud:
             problem.origin,
         )
 
-    def weighed(self, factor: Array) -> Cloud:
+    def weighed(self, factor: Array, workers: Workers) -> Cloud:
         """Return the points with their weights times a factor (n,), without those of none."""
-        k = factor > 0
-        if k.all():
-            return replace(self, weights=factor * self.weights)
-        return replace(
-            self,
-            points=self.points[k],
-            weights=factor[k] * self.weights[k],
-            frame=self.frame[k],
-            source=self.source[k],
-        )
+        if not (factor > 0).all():
+            k = np.flatnonzero(factor > 0)
+            return self.taken(k, workers).weighed(factor[k], workers)
+        return replace(self, weights=factor * self.weights)
+
+    def taken(self, these: Ints, workers: Workers) -> Cloud:
+        """Return some of the points, (m,), in that order."""
+        n = len(these)
+        points, weights = np.empty((n, 3), np.float32), np.empty(n)
+        frame, source = np.empty(n, np.int32), np.empty(n, np.int32)
+        workers.over(
+            n, laying_kernels.gather, these, self.points, self.weights, self.frame, self.source,
+            points, weights, frame, source,
+        )  # fmt: skip
+        return replace(self, points=points, weights=weights, frame=frame, source=source)
 
 
 def lay(
@@ -100,16 +105,12 @@ def lay(
         parts.append(_voxels(x, cloud, T_map_camera[:, :3, 3], left, side, workers))
         left = parts[-1].left
     order = np.concatenate([p.points for p in parts])
-    taken = np.empty((len(order), 3), np.float32), np.empty(len(order)), np.empty(len(order), np.int32)
-    workers.over(
-        len(order), laying_kernels.gather, order, cloud.points, cloud.weights, cloud.source, *taken
-    )
-    points, weights, source = taken
+    taken = cloud.taken(order, workers)
     each = np.repeat(sides, [len(p.centre) for p in parts])
     laid = Patches(
-        points=points,
-        weights=weights,
-        source=source,
+        points=taken.points,
+        weights=taken.weights,
+        source=taken.source,
         ends=_ends([p.sizes for p in parts]),
         frame=np.concatenate([p.frame for p in parts]),
         views=_ends([p.views for p in parts]),

@@ -128,10 +128,13 @@ def pool(group, spread, out):
 
 
 @kernel
-def gather(first, last, order, points, weights, source, points_out, weights_out, source_out):
-    """Take the points of an order, with all that is known of them."""
+def gather(
+    first, last, these, points, weights, frame, source,
+    points_out, weights_out, frame_out, source_out,
+):  # fmt: skip
+    """Take some points, with all that is known of them."""
     for k in range(first, last):
-        i = order[k]
+        i = these[k]
         for a in range(3):
             points_out[k, a] = points[i, a]
-        weights_out[k], source_out[k] = weights[i], source[i]
+        weights_out[k], frame_out[k], source_out[k] = weights[i], frame[i], source[i]

@@ -13,6 +13,7 @@ from depthba.optimiser.layers import down_weighted
 from depthba.optimiser.linearise import Loss
 from depthba.optimiser.patches import Fit
 from depthba.optimiser.problem import Problem
+from depthba.optimiser.workers import Workers
 from depthba.options import Options
 
 
@@ -35,6 +36,7 @@ def make_level(
     spacing: float,
     preset: schedule.Preset,
     options: Options,
+    workers: Workers,
     last: bool = True,
 ) -> Level:
     """Lay the grid of a level and fix what stays fixed on it. The last one takes every point."""
@@ -43,7 +45,7 @@ def make_level(
     grid = make_grid(problem, spacing, 2 * spacing)
     averages = average(problem, poses, grid)
     if preset.robust:
-        problem = down_weighted(problem, poses, spacing)
+        problem = down_weighted(problem, poses, spacing, workers)
     seen = averages.count > 0
     smooth = np.ones(grid.shape, bool) if preset.whole else near(seen, 3)
     typical = float(np.median(averages.count[seen])) if seen.any() else 1.0

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from depthba.optimiser import kernels, map_kernels
 from depthba.optimiser.asking import look
+from depthba.optimiser.deviation import robust_deviation
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.problem import FramePoints, Problem
 from depthba.optimiser.stencil import Stencil
@@ -197,7 +198,7 @@ def robust_sigma(residuals: tuple[NDArray[np.float32], ...]) -> float:
     """Return 1.4826 times the median absolute residual, m; 0 without any."""
     some = np.concatenate([r[:: max(1, len(r) // 5000)] for r in residuals])
     some = some[np.isfinite(some)]
-    return float(1.4826 * np.median(np.abs(some))) if len(some) else 0.0
+    return robust_deviation(some) if len(some) else 0.0
 
 
 def footprint(

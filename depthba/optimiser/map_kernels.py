@@ -113,12 +113,12 @@ def look_up(points, R, t, origin, spacing, field, out):
 
 
 @kernel
-def splat_residuals(points, R, t, origin, spacing, nodes, total, squares, count):
+def splat_residuals(points, R, t, origin, spacing, nodes, out):
     """Add the points' vertical distances from the map to the nodes nearest to them.
 
-    Sum, squares and number.
+    Sum, squares and number, (ny, nx, 3).
     """
-    ny, nx = total.shape
+    ny, nx = out.shape[:2]
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0] - origin[0]) / spacing
@@ -131,6 +131,21 @@ def splat_residuals(points, R, t, origin, spacing, nodes, total, squares, count)
         height += b * ((1 - a) * nodes[y + 1, x, 0] + a * nodes[y + 1, x + 1, 0])
         r = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2] - height
         x, y = int(np.floor(cx + 0.5)), int(np.floor(cy + 0.5))
-        total[y, x] += r
-        squares[y, x] += r * r
-        count[y, x] += 1.0
+        out[y, x, 0] += r
+        out[y, x, 1] += r * r
+        out[y, x, 2] += 1.0
+
+
+@kernel
+def pool_scatter(found, squares, freedom):
+    """Add the scatter about their mean of what fell on nodes, and its degrees of freedom.
+
+    ``found`` is what :func:`splat_residuals` leaves.
+    """
+    ny, nx = squares.shape
+    for y in range(ny):
+        for x in range(nx):
+            total, square, count = found[y, x]
+            if count > 1.0:
+                squares[y, x] += square - total * total / count
+                freedom[y, x] += count - 1.0

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import probes
+from depthba.optimiser.deviation import robust_deviation
 from depthba.optimiser.feet import Ground
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State, robust_sigma
 from depthba.optimiser.problem import FramePoints, Problem
+from depthba.optimiser.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -44,7 +46,7 @@ def noise_sigma(
 ) -> float:
     """Return the robust standard deviation of the points' noise, m."""
     each = np.concatenate([s.sizes for s in studentised(problem, grid, state, loss, lin)])
-    return _deviation(each) if len(each) else robust_sigma(lin.residuals)
+    return robust_deviation(each) if len(each) else robust_sigma(lin.residuals)
 
 
 def studentised(
@@ -91,11 +93,11 @@ class ByRange:
         """The largest factor, or inverse of one."""
         return float(np.exp(np.abs(np.log(self.factors)).max())) if len(self.factors) else 1.0
 
-    def applied(self, problem: Problem) -> Problem:
+    def applied(self, problem: Problem, workers: Workers) -> Problem:
         """Return the problem with its points taken for as noisy as that."""
         if not len(self.factors):
             return problem
-        return replace(problem, frames=tuple(map(self._of, problem.frames)))
+        return replace(problem, frames=tuple(workers.map(self._of, problem.frames)))
 
     def _of(self, frame: FramePoints) -> FramePoints:
         factor = np.interp(_ranges(frame.points), self.ranges, self.factors).astype(np.float32)
@@ -118,15 +120,11 @@ def by_range(problem: Problem, grid: Grid, state: State, loss: Loss, lin: Linear
     ranges = np.array([np.median(away[p]) for p in parts])
     if ranges[-1] < SAME * ranges[0]:
         return ByRange.as_stated()
-    deviations = np.array([_deviation(sizes[p]) for p in parts])
+    deviations = np.array([robust_deviation(sizes[p]) for p in parts])
     typical = float(np.median(deviations))
     if not typical:
         return ByRange.as_stated()
     return ByRange(ranges, np.clip(deviations / typical, LEAST, MOST))
-
-
-def _deviation(sizes: Array) -> float:
-    return float(1.4826 * np.median(sizes))
 
 
 def _ranges(points: NDArray[np.float32]) -> Array:

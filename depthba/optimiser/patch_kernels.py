@@ -235,13 +235,16 @@ def scores(
 
 
 @kernel
-def medians(these, ends, off, out):
-    """Write to ``out`` (k,) the median size of the values of some runs; one ends, one begins."""
+def medians(begin, end, these, ends, off, out):
+    """Write to ``out`` (k,) the median size of the values of some runs; one ends, one begins.
+
+    Of the runs ``begin`` to ``end`` of ``these`` alone.
+    """
     most = 0
-    for k in these:
+    for k in these[begin:end]:
         most = max(most, ends[k + 1] - ends[k])
     space = np.empty(most)
-    for j in range(len(these)):
+    for j in range(begin, end):
         first, last = ends[these[j]], ends[these[j] + 1]
         for i in range(first, last):
             space[i - first] = abs(off[i])

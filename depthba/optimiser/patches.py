@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from depthba.optimiser import patch_kernels, patch_points
+from depthba.optimiser.deviation import robust_deviation
 from depthba.optimiser.workers import SHARES, Workers
 
 Array = NDArray[np.float64]
@@ -202,7 +203,7 @@ class Fit:
     off: Array
     """(n,) how far every point lies off its surface, m at a point of typical noise."""
 
-    def true(self, most: float) -> Patches:
+    def true(self, most: float, workers: Workers) -> Patches:
         """Return the steep patches whose points lie on their surface but for noise.
 
         ``most``: median distance from the surface of the points of a patch, m.
@@ -210,7 +211,8 @@ class Fit:
         patches = self.patches
         steep = np.flatnonzero(np.abs(patches.axes[:, 2, 0]) <= LEVEL)
         median = np.empty(len(steep))
-        patch_kernels.medians(steep, patches.ends[patches.views], self.off, median)
+        ends = patches.ends[patches.views]
+        workers.over(len(steep), patch_kernels.medians, steep, ends, self.off, median)
         chosen = np.zeros(len(patches), bool)
         chosen[steep[median <= most]] = True
         return patches.only(chosen)
@@ -229,8 +231,8 @@ class Fit:
         if not len(self.patches):
             return self
         patches = self.patches
-        some = np.abs(self.off[:: -(-len(self.off) // ENOUGH)])
-        scale = patches.robust * max(1.4826 * float(np.median(some)), LEAST * sigma)
+        shown = robust_deviation(self.off[:: -(-len(self.off) // ENOUGH)])
+        scale = patches.robust * max(shown, LEAST * sigma)
         scale = min(scale, patches.scale or scale)
         cost = patch_kernels.charge_of(self.off, scale**2)
         cost += float((patches.stiff[:, None] * patches.surface[:, 3:] ** 2).sum())

@@ -46,7 +46,7 @@ class PosePrior:
 
     def at(self, T_map_camera: NDArray[np.float64]) -> PriorAt:
         """Return where poses (N, 4, 4) stand: the errors that cost least."""
-        if not self.shared:
+        if self.gauge is None or not self.shared:
             K = np.zeros((len(T_map_camera), 6, 6))
             e = se3.difference(T_map_camera, self.T_map_camera)
             return PriorAt(self, T_map_camera, e, np.eye(3), K, 0.0)

@@ -146,10 +146,10 @@ def patches_beside(
     """
     stride = -(-sum(map(len, problem.frames)) // MOST_BESIDE)
     some = problem.thinned(stride)
-    rough = np.concatenate(rough_points(some, T_map_camera, spacing))
+    rough = np.concatenate(rough_points(some, T_map_camera, spacing, workers))
     sides = tuple(s * fine * float(np.sqrt(stride)) for s in CLOSE.sides)
     cloud = Cloud.of(some)
     cloud = replace(cloud, source=stride * cloud.source)
-    cloud = cloud.weighed(np.where(rough, 1.0, shared))
-    laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).true(TRUE * sigma)
+    cloud = cloud.weighed(np.where(rough, 1.0, shared), workers)
+    laid = lay(cloud, T_map_camera, sides, robust, sigma, workers).true(TRUE * sigma, workers)
     return laid.fitted(T_map_camera, workers).rescaled(sigma) if len(laid) else None

@@ -64,9 +64,9 @@ class Case:
 
     def told(self, threads: int = 2) -> Problem:
         """Return the problem with its points counting as far as they tell."""
-        return crowding.told(
-            self.problem, GRID, self.state, LOSS, self.lin, Workers(threads)
-        ).applied(self.problem)
+        workers = Workers(threads)
+        told = crowding.told(self.problem, GRID, self.state, LOSS, self.lin, workers)
+        return told.applied(self.problem, workers)
 
 
 def test_places_are_voxels() -> None:

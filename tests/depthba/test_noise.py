@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from depthba.optimiser.deviation import robust_deviation
 from depthba.optimiser.grid import Grid
 from depthba.optimiser.linearise import Linearisation, Loss, State
 from depthba.optimiser.noise import by_range, noise_sigma
@@ -41,7 +42,7 @@ def test_noise_that_differs_over_the_range_is_found(near: float, far: float, per
     close, away = np.interp([0.6, 1.0], shown.ranges, shown.factors)
     assert close / away == pytest.approx(near / far, rel=0.12)
     # with that taken into account nothing is left to find
-    weighed = shown.applied(problem)
+    weighed = shown.applied(problem, Workers(1))
     again = by_range(weighed, GRID, *_of(weighed, T))
     assert again.wrong < 1.12
     assert shown.wrong > 1.2 or near == far
@@ -51,9 +52,18 @@ def test_noise_is_as_stated_where_the_range_says_nothing() -> None:
     T, clouds = flat_case(100)
     problem = problem_of(clouds, T)
     shown = by_range(problem, GRID, *_of(problem, T))
-    assert shown.wrong == 1.0 and shown.applied(problem) is problem
+    assert shown.wrong == 1.0 and shown.applied(problem, Workers(1)) is problem
 
 
 def _of(problem: Problem, T: Floats) -> tuple[State, Loss, Linearisation]:
     state, lin = solved(problem, T)
     return state, LOSS, lin
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 1000])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_robust_deviation_is_what_the_median_says(count: int, dtype: type) -> None:
+    values = np.random.default_rng(count).normal(size=count).astype(dtype)
+    before = values.copy()
+    assert robust_deviation(values) == float(1.4826 * np.median(np.abs(values)))
+    assert (values == before).all()

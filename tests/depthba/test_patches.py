@@ -169,7 +169,7 @@ def test_a_voxel_that_one_frame_sees_is_no_patch(workers):
     T = poses(rng)
     cloud = balls(rng, T, 1e-4)
     alone = cloud.frame == 1
-    one = cloud.weighed(alone.astype(float))
+    one = cloud.weighed(alone.astype(float), Workers(1))
     fit = lay(one, T, (0.06, 0.03), 3.5, 1e-4, workers)
     assert len(fit.patches) == 0
     assert fit.cost == 0.0
