@@ -32,7 +32,7 @@ from eval.metrics import Metric, pose_metrics
 from eval.recorded_frames import log_cloud, log_frustum, log_pose, shown_clouds
 from eval.recorded_map import picture
 from eval.recorded_residuals import SPAN, colours, residuals, robust_sigma
-from eval.recording import close_stream, open_stream
+from eval.recording_file import RecordingFile
 from eval.recording_layout import compare_blueprint, frame_colours
 from eval.report import comparison_page
 from eval.self_consistency import map_rotation
@@ -138,8 +138,8 @@ def compare(
     cell = CELL_SPACINGS * point_spacing(dataset, [c.points for c in clouds])
     aligned = [se3.align_first(p.T_world_camera, T_start) for p in shown]
     views = [_View.of(clouds, T, T_map_world, cell) for T in aligned]
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    rec = open_stream(part)
+    file = RecordingFile(path)
+    rec = file.stream
     try:
         rec.send_recording_name(f"{dataset.name}: {len(placements)} runs")
         _log_runs(rec, dataset, clouds, aligned, views)
@@ -151,11 +151,10 @@ def compare(
         rec.log("figures", page, static=True)
         layout = compare_blueprint([p.label for p in shown], views[-1].depth_map, T_start)
         rec.send_blueprint(layout)
-        close_stream(rec)
-        part.replace(path)
-    finally:
-        rec.disconnect()
-        part.unlink(missing_ok=True)
+        file.finish()
+    except BaseException:
+        file.discard()
+        raise
 
 
 @dataclass(frozen=True, eq=False)

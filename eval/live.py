@@ -24,7 +24,7 @@ from depthba.dataset import Frame, Sensor
 from depthba.errors import RunError
 from eval import review
 from eval.recorded_frames import COVER, ShownCloud, log_cloud, log_frustum, log_pose
-from eval.recording import close_stream, open_stream
+from eval.recording_file import RecordingFile
 from eval.recording_layout import capture_blueprint, frame_colours
 
 Floats = NDArray[np.float64]
@@ -141,16 +141,14 @@ class CaptureLog:
 
         Raises:
             RunError: there is neither a recording nor a viewer.
+            OSError: the recording cannot be written.
 
         """
         if path is None and viewer is None:
             raise RunError("capture log: neither a recording nor a viewer, expected one or both")
         self._sensor, self._name = sensor, name
-        self._path = None if path is None else Path(path)
-        self._part = None
-        if self._path is not None:
-            self._part = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
-        self._stream = open_stream(self._part, viewer)
+        self._file = RecordingFile(None if path is None else Path(path), viewer)
+        self._stream = self._file.stream
         self._stream.send_recording_name(name)
         self._stream.send_blueprint(capture_blueprint())
         self._way: list[Floats] = []
@@ -199,16 +197,17 @@ class CaptureLog:
             log_pose(self._stream, f"cam/{i}", T)
 
     def finish(self) -> None:
-        """End the session and put the recording into its place."""
-        close_stream(self._stream)
-        if self._part is not None and self._path is not None:
-            self._part.replace(self._path)
+        """End the session and put the recording into its place.
+
+        Raises:
+            OSError: the recording could not be written.
+
+        """
+        self._file.finish()
 
     def discard(self) -> None:
         """End the session and leave no recording."""
-        self._stream.disconnect()
-        if self._part is not None:
-            self._part.unlink(missing_ok=True)
+        self._file.discard()
 
     def _time(self, stamp: float) -> None:
         self._began = stamp if self._began is None else self._began

@@ -18,7 +18,6 @@ Iteration 0 is the start, iteration k + 1 what step k left. Frames count from 0 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -44,19 +43,15 @@ from eval.recorded_certainty import log_certainty
 from eval.recorded_frames import log_centres, log_cloud, log_frustum, log_pose, shown_clouds
 from eval.recorded_map import RecordedMap
 from eval.recorded_residuals import RecordedResiduals
+from eval.recording_file import RecordingFile
 from eval.recording_layout import blueprint, frame_colours, live_blueprint
 from eval.report import figures_page
 from eval.review import viewer
 
 Floats = NDArray[np.float64]
 
-APPLICATION = "depthba"
 MILLI = 1e3
 """Curves are in millimetres and milliradians: their axes can be read."""
-FLUSH_SECONDS = 20.0
-"""For what is on its way to a viewer or to the disk."""
-PART_SECONDS = 30.0
-"""After so much time a part of the recording is written."""
 SCALARS = ("cost", "sigma", "step_t", "step_r", "inliers", "spacing")
 
 CURVES: Mapping[str, tuple[str, tuple[int, int, int]]] = {
@@ -96,7 +91,6 @@ class Recorder:
 
         """
         self.path = Path(path)
-        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         self._dataset = dataset
         self._options = options or Options()
         self._clouds = load_clouds(dataset, colours=False) if clouds is None else tuple(clouds)
@@ -106,7 +100,8 @@ class Recorder:
         self._residuals: RecordedResiduals | None = None
         self._last = (0, 0.0)
         self._live = viewer is not None
-        self._stream = open_stream(self._part, viewer)
+        self._file = RecordingFile(self.path, viewer)
+        self._stream = self._file.stream
         self._stream.send_recording_name(self.path.resolve().parent.name)
 
     def __call__(self, iteration: Iteration) -> None:
@@ -149,6 +144,9 @@ class Recorder:
             metrics: what `eval.evaluate.evaluate` returned; None: the page of figures does without.
             run: what result.json holds; None: it is made of the result.
 
+        Raises:
+            OSError: the file could not be written.
+
         """
         run = summary(result, self._options, self._dataset) if run is None else run
         self._begin(result.T_world_camera_start, result.depth_map_start)
@@ -170,13 +168,11 @@ class Recorder:
                 scale=scale,
             )
         )
-        close_stream(rec)
-        self._part.replace(self.path)
+        self._file.finish()
 
     def discard(self) -> None:
         """End without a recording and leave no file."""
-        self._stream.disconnect()
-        self._part.unlink(missing_ok=True)
+        self._file.discard()
 
     def _begin(self, T_world_camera: Floats, depth_map: DepthMap) -> None:
         """Record, once, what stays as it is: the frames' points and the names of the curves."""
@@ -240,30 +236,6 @@ class Recorder:
                 self._stream.log(path, rr.Scalars(value))
 
 
-def open_stream(path: Path | None, viewer: str | None = None) -> rr.RecordingStream:
-    """Begin a recording into a file, a viewer or both; no times but those that are set.
-
-    Without a viewer that waits for it, what comes is put together into few large parts: they are
-    read faster.
-    """
-    parts = rr.ChunkBatcherConfig(flush_tick=PART_SECONDS) if viewer is None else None
-    rec = rr.RecordingStream(APPLICATION, batcher_config=parts)
-    rec.set_log_tick_enabled(False)
-    rec.set_log_time_enabled(False)
-    sinks: list[Any] = [] if path is None else [rr.FileSink(path)]
-    if viewer is not None:
-        sinks.append(rr.GrpcSink(viewer))
-    rec.set_sinks(*sinks)
-    return rec
-
-
-def close_stream(rec: rr.RecordingStream) -> None:
-    """Bring everything to where it goes; a viewer that has been closed does not count."""
-    with contextlib.suppress(RuntimeError):
-        rec.flush(timeout_sec=FLUSH_SECONDS)
-    rec.disconnect()
-
-
 def add_figures(path: Path, run: Mapping[str, Any], metrics: Sequence[Metric]) -> None:
     """Put the metrics into a recording that is there already.
 
@@ -282,12 +254,13 @@ def add_figures(path: Path, run: Mapping[str, Any], metrics: Sequence[Metric]) -
         rec = rr.RecordingStream(
             entry.application_id, recording_id=entry.recording_id, send_properties=False
         )
-        rec.set_log_tick_enabled(False)
-        rec.set_log_time_enabled(False)
-        rec.save(more)
-        _log_figures(rec, run, metrics)
-        rec.flush()
-        rec.disconnect()
+        added = RecordingFile(more, stream=rec)
+        try:
+            _log_figures(rec, run, metrics)
+            added.finish()
+        except BaseException:
+            added.discard()
+            raise
         merge = [str(viewer()), "rrd", "merge", str(path), str(more), "-o", str(whole)]
         subprocess.run(merge, check=True, capture_output=True)
         whole.replace(path)
