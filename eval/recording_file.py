@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import selectors
 import threading
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ PART_SECONDS = 30.0
 """After so much time a part of the recording is written."""
 _AT_ONCE = 1 << 20
 """Bytes that are taken from the pipe."""
+_LOOK_SECONDS = 0.1
+"""After so long without any it is asked whether more will come."""
 
 
 class RecordingFile:
@@ -112,6 +115,7 @@ class _Drain:
         self._file = path.open("wb", buffering=0)
         self._outlet, self.inlet = os.pipe()
         self._error: OSError | None = None
+        self._last = threading.Event()
         # not waited for where nobody ends the recording
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
@@ -121,22 +125,26 @@ class _Drain:
         os.close(self.inlet)
 
     def close(self) -> None:
-        """Wait for the end; OSError where not everything is in the file."""
-        self._thread.join(FLUSH_SECONDS)
-        if self._thread.is_alive():
-            raise TimeoutError(f"{self._path}: not written after {FLUSH_SECONDS:g} s")
+        """Wait until what is in the pipe by now is in the file; OSError where not all of it is."""
+        self._last.set()
+        self._thread.join()
         if self._error is not None:
             raise OSError(self._error.errno, self._error.strerror, str(self._path))
 
     def _run(self) -> None:
-        with open(self._outlet, "rb", buffering=0) as source, self._file as file:
-            while part := source.read(_AT_ONCE):
-                self._write(part)
-            if self._error is None:
-                try:
-                    os.fsync(file.fileno())
-                except OSError as error:
-                    self._error = error
+        with self._file as file, selectors.DefaultSelector() as pipe:
+            pipe.register(self._outlet, selectors.EVENT_READ)
+            # it has no end for as long as a process that was forked meanwhile holds it open, too
+            while (ready := pipe.select(_LOOK_SECONDS)) or not self._last.is_set():
+                part = os.read(self._outlet, _AT_ONCE) if ready else None
+                if part == b"":
+                    break
+                self._write(part or b"")
+            os.close(self._outlet)
+            try:
+                os.fsync(file.fileno())
+            except OSError as error:
+                self._error = self._error or error
 
     def _write(self, part: bytes) -> None:
         left = memoryview(part)

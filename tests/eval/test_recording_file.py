@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +60,29 @@ def test_a_recording_is_whole_once_finished(tmp_path: Path) -> None:
     assert entry.application_id == "depthba"
     chunks = [c for c in RrdReader(path).stream().to_chunks() if c.entity_path == "/points"]
     assert len(chunks) == 1
+
+
+def test_a_process_forked_meanwhile_keeps_no_recording_open(tmp_path: Path) -> None:
+    file = RecordingFile(tmp_path / "run.rrd")
+    # as a fork, it holds all that is open here
+    other = subprocess.Popen(["sleep", "60"], pass_fds=_open_files())
+    try:
+        file.stream.log("points", rr.Points3D(np.ones((10, 3))), static=True)
+        file.finish()
+    finally:
+        other.kill()
+        other.wait()
+    assert len(list(RrdReader(tmp_path / "run.rrd").recordings())) == 1
+
+
+def _open_files() -> list[int]:
+    """Return the numbers of what is open, those of this look left out."""
+    found = []
+    for name in os.listdir("/dev/fd"):
+        with contextlib.suppress(OSError):
+            os.fstat(int(name))
+            found.append(int(name))
+    return found
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
