@@ -156,7 +156,7 @@ class Engine:
                 state, lin = outcome.state, outcome.lin
                 self.clock.lap(f"level {index} {phase}")
             if last:
-                shown, told = self._shown(level, outcome), self._told(level, outcome)
+                shown, told = self._seen(level, outcome)
                 if level.tied or shown.wrong > NOTICEABLE or told.shares:
                     # where the poses have got to, patches lie better and points show their noise
                     level = self.weighed(self.weighed(level, shown), told)
@@ -194,18 +194,12 @@ class Engine:
         self.clock.lap(f"level {index} {phase}")
         return End(level, outcome, temperature, index, known.inflation if known else 1.0, S)
 
-    def _shown(self, level: Level, outcome: Outcome) -> ByRange:
-        """Return how the noise over the range differs from the one reckoned with."""
+    def _seen(self, level: Level, outcome: Outcome) -> tuple[ByRange, crowding.Told]:
+        """Return how the noise over the range differs from the one reckoned with, and crowding."""
         if not self.preset.robust or self.clock.over:
-            return ByRange.as_stated()
-        return by_range(level.problem, level.grid, outcome.state, outcome.loss, outcome.lin)
-
-    def _told(self, level: Level, outcome: Outcome) -> crowding.Told:
-        """Return what points tell beside those close to them."""
-        if not self.preset.robust or self.clock.over:
-            return crowding.Told()
-        there = outcome.state, outcome.loss, outcome.lin
-        return crowding.told(level.problem, level.grid, *there, self.workers)
+            return ByRange.as_stated(), crowding.Told()
+        there = level.problem, level.grid, outcome.state, outcome.loss, outcome.lin
+        return by_range(*there), crowding.told(*there, self.workers)
 
     def weighed(self, level: Level, shown: ByRange | crowding.Told) -> Level:
         """Let all points count as was shown; return the level with its points likewise."""
@@ -248,7 +242,10 @@ class Engine:
         """Return the poses as patches alone would have them."""
         if not self.preset.robust or self.clock.over:
             return poses
-        inflation = self.doubt * (known.inflation if known else 1.0)
+        inflation = known.inflation if known else 1.0
+        if known and self.doubted:
+            # only the measured poses keep the frames of a bare table from sliding
+            inflation = CAUTION * max(inflation, known.overall)
         poses = tied_by_patches(
             self.problem, poses, self._fine(spacing), self.prior, self.acting, inflation, self.free,
             self.workers,

@@ -187,13 +187,7 @@ def _voxels(
     total, pooled = np.bincount(on, weight[many], k), np.zeros((k, 3, 3))
     laying_kernels.pool(on, spread[many], pooled)
     values, axes = np.empty((k, 3)), np.empty((k, 3, 3))
-
-    def decompose(first: int, last: int) -> None:
-        values[first:last], found = np.linalg.eigh(pooled[first:last])
-        found[:, :, 2] *= np.sign(np.linalg.det(found))[:, None]
-        axes[first:last] = found
-
-    workers.over(k, decompose)
+    workers.over(k, laying_kernels.principal, pooled, values, axes)
     good = (values[:, 1] > FLAT**2 * values[:, 0]) & (values[:, 1] > total * (WIDE * side) ** 2)
     views = np.flatnonzero(many)[good[on]]
     patch = on[good[on]]

@@ -53,16 +53,16 @@ class PosePrior:
         G, x = np.eye(4)[None], np.zeros(6)
         for k in range(ROUNDS + 1):
             measured = self.T_map_camera @ se3.make(se3.exp_so3(x[3:]), x[:3])
-            first, moved = self.T_map_camera[:1], G @ T_map_camera
-            centre = (G @ first)[:, :3, 3]
-            own = se3.difference(G @ first, measured[:1])[0]
-            e = se3.difference(moved, measured)
+            moved = G @ np.concatenate([self.T_map_camera[:1], T_map_camera])
+            errors = se3.difference(moved, np.concatenate([measured[:1], measured]))
+            own, e = errors[0], errors[1:]
             if k == ROUNDS:
                 break
-            K = about_pivot(moved, centre)
+            centre = moved[:1, :3, 3]
+            K = about_pivot(moved[1:], centre)
             if self.hand_eye is not None:
                 K = np.concatenate([K, -_in_map(self.T_map_camera)], axis=2)
-            b = np.einsum("nji,njk,nk->i", K, self.information, e)
+            b = np.einsum("nki,nk->i", self.information @ K, e)
             b += self._of_first(K).T @ self.gauge @ own
             if self.hand_eye is not None:
                 b[6:] += self.hand_eye @ x
@@ -83,7 +83,7 @@ class PosePrior:
         """Return the inverse (m, m) of what holds the motions that all frames share."""
         first = self._of_first(K)
         assert self.gauge is not None  # else nothing is shared
-        H = first.T @ self.gauge @ first + np.einsum("nji,njk,nkl->il", K, self.information, K)
+        H = first.T @ self.gauge @ first + np.einsum("nki,nkl->il", K, self.information @ K)
         if self.hand_eye is not None:
             H[6:, 6:] += self.hand_eye
         own = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
