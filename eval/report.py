@@ -40,6 +40,7 @@ NAMES = {
     "spread_p90": "Disagreement of frames, 90 % of cells",
     "point_to_plane_median": "Point to plane between frames, median pair",
     "point_to_plane_worst_pair": "Point to plane between frames, worst pair",
+    "same_face_median": "Point to plane, same side of walls, median pair",
     "patch_thickness": "Thickness of planar patches, median",
     "mean_map_entropy": "Mean map entropy (lengths in metres)",
 }
